@@ -1,0 +1,33 @@
+# Two commands, each doing all of its set-up on a fresh machine:
+#   make run    the main job; RECORDINGS=DIR ROBOT=NAME take your own data, ARGS=... passes options on
+#   make test   linters, types, import floors and the tests
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out
+ROBOT ?= darwin_op2
+
+.PHONY: run test slow lint clean
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
+	touch $@
+
+run: $(VENV)/.installed
+	$(BIN)/pup run --out $(OUT) $(if $(RECORDINGS),--recordings $(RECORDINGS) --robot $(ROBOT)) $(ARGS)
+
+lint: $(VENV)/.installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint
+	$(BIN)/python -m pytest
+
+slow: $(VENV)/.installed
+	$(BIN)/python -m pytest -m slow
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

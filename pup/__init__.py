@@ -1,0 +1,1 @@
+"""pup: from a simulator that is wrong to a robot that walks."""

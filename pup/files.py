@@ -1,0 +1,67 @@
+"""Files written whole or not at all, and JSON read within limits."""
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+
+JSON_LIMIT = 64 * 2**20  # bytes
+
+
+def write_atomic(path: Path, data: bytes | str) -> None:
+    """Write a file through a temporary neighbour and a rename.
+
+    Args:
+      path: where the file shall stand; its folder is made when absent.
+      data: the content; text is written as UTF-8.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    raw = data.encode() if isinstance(data, str) else data
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(raw)
+            file.flush()
+            os.fsync(file.fileno())
+            os.fchmod(file.fileno(), 0o666 & ~_umask())  # a temporary file is its owner's alone
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    """The process's file creation mask; it can only be read by setting it."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON document atomically; NaN and infinity are refused."""
+    write_atomic(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, limit: int = JSON_LIMIT) -> Any:
+    """Read a JSON document.
+
+    Args:
+      path: the file.
+      limit: largest size accepted, in bytes.
+
+    Raises:
+      InputError: the file is absent, too large or no JSON.
+    """
+    try:
+        if path.stat().st_size > limit:
+            raise InputError(f"{path}: larger than {limit} bytes; is this the right file?")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a JSON document ({error})") from error

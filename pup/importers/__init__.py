@@ -1,0 +1,95 @@
+"""Other people's logs, turned into recordings: one module per format."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pup.errors import InputError
+from pup.importers import bam, csv_format, darwin_hardware, emps, mcap_format, npz, sage
+from pup.importers.common import ImportOptions
+from pup.recording import Recording
+from pup.robot import RobotDescription
+
+__all__ = ["FORMATS", "ImportOptions", "import_recordings"]
+
+Importer = Callable[[Path, ImportOptions], list[Recording]]
+
+FORMATS: dict[str, Importer] = {
+    "bam": bam.read,
+    "csv": csv_format.read,
+    "darwin-hardware": darwin_hardware.read,
+    "emps": emps.read,
+    "mcap": mcap_format.read,
+    "npz": npz.read,
+    "sage": sage.read,
+}
+PATTERNS = {
+    "bam": "*.json",
+    "csv": "*.csv",
+    "darwin-hardware": "*.json",
+    "emps": "*.mat",
+    "mcap": "*.mcap",
+    "npz": "*.npz",
+    "sage": "**/control.csv",
+}
+"""What is taken from a folder."""
+
+
+def import_recordings(
+    format: str,
+    paths: Sequence[Path],
+    robot: RobotDescription | None = None,
+    options: ImportOptions | None = None,
+) -> tuple[Recording, ...]:
+    """Read logs of one format.
+
+    Args:
+      format: a key of `FORMATS`.
+      paths: log files, or folders that hold some.
+      robot: when given, every recording must be of exactly its joints and takes its name.
+      options: what the logs do not say.
+
+    Returns:
+      The recordings, sorted by id.
+
+    Raises:
+      InputError: a log cannot be read or breaks a rule; the message names the file.
+    """
+    if format not in FORMATS:
+        raise InputError(f"format {format!r} is unknown; use one of {', '.join(sorted(FORMATS))}")
+    options = options or ImportOptions()
+    if robot is not None:
+        options = replace(options, robot=robot.name)
+    origin: dict[str, Path] = {}
+    recordings = []
+    for path in _logs(paths, PATTERNS[format]):
+        try:
+            found = FORMATS[format](path, options)
+            if robot is not None:
+                for recording in found:
+                    recording.validate(robot)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        for recording in found:
+            if recording.id in origin:
+                raise InputError(
+                    f"{path}: id {recording.id!r} is also that of {origin[recording.id]}; "
+                    "rename one of the files"
+                )
+            origin[recording.id] = path
+        recordings += found
+    return tuple(sorted(recordings, key=lambda recording: recording.id))
+
+
+def _logs(paths: Sequence[Path], pattern: str) -> list[Path]:
+    logs: list[Path] = []
+    for path in map(Path, paths):
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+        found = sorted(path.glob(pattern)) if path.is_dir() else [path]
+        if not found:
+            raise InputError(f"{path}: no {pattern} in this folder")
+        logs += found
+    if not logs:
+        raise InputError("no log given; name files or folders")
+    return logs

@@ -1,0 +1,1 @@
+"""Many simulations of one robot under many candidate parameters."""

@@ -1,0 +1,159 @@
+"""Parameters and setup knobs as per-simulation fields of a batch."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.physics.model import Model
+from pup.physics.parameters import Candidates
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+
+FLOOR = "floor"
+"""Name of the floor's geom in a robot's MJCF; its friction is the ground's (priority 1)."""
+
+_AXES = ("x", "y", "z")
+
+
+def scaled(
+    robot: RobotDescription, candidates: Candidates, setups: Sequence[dict[str, float]]
+) -> Candidates:
+    """One row per simulation, recording by recording, scaled as each recording's knobs say.
+
+    Args:
+      robot: says which knob scales which parameters.
+      candidates: n candidates.
+      setups: the knobs of each of the m recordings.
+
+    Returns:
+      m n rows, recording by recording.
+    """
+    blocks = []
+    for setup in setups:
+        values = candidates.values.copy()
+        for knob in robot.knobs:
+            for scaling in knob.scalings:
+                factor = setup[knob.name] / scaling.reference
+                if factor != 1.0:
+                    names = candidates.space.names
+                    values[:, [fnmatchcase(n, scaling.parameter) for n in names]] *= factor
+        blocks.append(values)
+    return Candidates(candidates.space, np.concatenate(blocks))
+
+
+def apply_fields(
+    batch: mujoco.batch.Batch,
+    robot: RobotDescription,
+    model: Model,
+    parameters: Candidates,
+    setups: Sequence[dict[str, float]],
+    armature: Array,
+) -> Array:
+    """Write the model fields of every simulation.
+
+    Args:
+      batch: the simulations.
+      robot: the robot.
+      model: its compiled model.
+      parameters: one row per simulation.
+      setups: the knobs of each recording; the simulations stand recording by recording.
+      armature: rotor inertia, broadcastable to (n_simulations, n_joints), kg m².
+
+    Returns:
+      Viscous damping outside the servo, shape (n_simulations, n_joints), N m s/rad.
+    """
+    writer = _Writer(batch, model.compiled)
+    each = len(parameters) // len(setups)
+    for knob in robot.knobs:
+        values = np.repeat([setup[knob.name] for setup in setups], each)
+        if (values == knob.default).all():
+            continue  # the MJCF is written at the knobs' defaults
+        for edit in knob.edits:
+            field = writer.element(edit.field, edit.element)
+            column = ... if edit.index is None else (..., edit.index)
+            field[column] = edit.scale * values + edit.offset
+    viscous = np.tile(model.compiled.dof_damping[model.dofs], (len(parameters), 1))
+    if np.any(armature):
+        writer.field("dof_armature")[:, model.dofs] = armature
+    for name in parameters.space.names:
+        _apply(writer, robot, model, name, parameters[name], viscous)
+    writer.done()
+    return viscous
+
+
+def _apply(
+    writer: "_Writer",
+    robot: RobotDescription,
+    model: Model,
+    name: str,
+    values: Array,
+    viscous: Array,
+) -> None:
+    """Write one parameter; those of the torque law, which it reads itself, pass."""
+    kind, _, place = name.partition("/")
+    if kind == "torso_com" and robot.torso:
+        writer.element("body_ipos", robot.torso)[:, _AXES.index(place)] += values
+    elif kind == "com":
+        body, _, axis = place.rpartition("/")
+        writer.element("body_ipos", body)[:, _AXES.index(axis)] += values
+    elif kind == "mass":
+        writer.element("body_mass", place)[:] *= values
+        writer.element("body_inertia", place)[:] *= values[:, None]
+    elif kind == "ground_friction":
+        if model.floating:
+            writer.element("geom_friction", FLOOR)[:, 0] = values
+    elif kind == "damping":
+        viscous[:, _of_group(robot, place)] += values[:, None]
+    elif kind == "coulomb":
+        dofs = np.arange(model.compiled.nv)[model.dofs][_of_group(robot, place)]
+        writer.field("dof_frictionloss")[:, dofs] += values[:, None]
+    elif kind not in _LAW_PARAMETERS:
+        raise InputError(
+            f"{robot.folder / 'robot.toml'}: parameter {name!r} means nothing to the physics; "
+            "see docs for the names it knows"
+        )
+
+
+_LAW_PARAMETERS = frozenset(
+    ("rho", "sigma", "torque_limit", "phi", "kp", "kd", "tau_max", "armature", "command_delay")
+)
+
+
+def _of_group(robot: RobotDescription, group: str) -> NDArray[np.bool_]:
+    return np.array([joint.group == group for joint in robot.joints])
+
+
+class _Writer:
+    """Per-simulation fields, with the constants MuJoCo derives from them kept in step."""
+
+    def __init__(self, batch: mujoco.batch.Batch, model: mujoco.MjModel) -> None:
+        self.batch = batch
+        self.model = model
+        self.stale = False
+
+    def field(self, name: str) -> Array:
+        """A model field, live, shape (n_simulations, ...)."""
+        self.stale |= name in mujoco.MjModel._setconst_inputs
+        return np.asarray(self.batch.expand(name))
+
+    def element(self, name: str, element: str) -> Array:
+        """One named element of a model field, live, shape (n_simulations, ...)."""
+        kind = {"jnt": "joint", "dof": "joint"}.get(name.split("_")[0], name.split("_")[0])
+        accessor = getattr(self.model, kind)
+        index = (
+            int(self.model.joint(element).dofadr[0])
+            if name.startswith("dof_")
+            else accessor(element).id
+        )
+        return self.field(name)[:, index]
+
+    def done(self) -> None:
+        """Recompute what follows from the fields written."""
+        if self.stale:
+            self.batch.set_const()

@@ -1,0 +1,159 @@
+"""From a robot's description to a compiled MuJoCo model, and the pose a recording starts in."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.recording import Recording
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+Selection = slice | NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A compiled model and where the robot's joints stand in it.
+
+    Attributes:
+      compiled: the MuJoCo model, without actuators: the engine applies joint torques.
+      qpos: where the joints' positions stand in qpos, in the robot's order.
+      dofs: where their velocities stand in qvel.
+      floating: whether the torso is free.
+    """
+
+    compiled: mujoco.MjModel
+    qpos: Selection
+    dofs: Selection
+    floating: bool
+
+
+@lru_cache(maxsize=32)
+def compile_model(robot: RobotDescription, support: str) -> Model:
+    """Compile a robot for one kind of support.
+
+    Suspended, the torso is fixed and nothing touches; on the ground it is free; on the bench the
+    model stays as it is, without contact.
+
+    Args:
+      robot: the robot.
+      support: `suspended`, `ground` or `bench`.
+
+    Raises:
+      InputError: MuJoCo refuses the model, or the robot cannot stand on that support.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(robot.model_path))
+        for actuator in list(spec.actuators):
+            spec.delete(actuator)
+        for key in list(spec.keys):
+            spec.delete(key)  # key frames change length with the joints
+        free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
+        if support == "suspended":
+            for joint in free:
+                spec.delete(joint)
+        spec.option.timestep = robot.timestep
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        if support != "ground":
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        compiled = spec.compile()
+    except ValueError as error:
+        raise InputError(f"{robot.model_path}: MuJoCo refuses it: {_one_line(error)}") from error
+    floating = support == "ground" and bool(free)
+    if support == "ground" and not floating:
+        raise InputError(
+            f"robot {robot.name!r} has a fixed base and cannot be on the ground; "
+            "the recording's support should be 'bench'"
+        )
+    ids = [compiled.joint(name).id for name in robot.joint_names]
+    return Model(
+        compiled,
+        _selection(compiled.jnt_qposadr[ids]),
+        _selection(compiled.jnt_dofadr[ids]),
+        floating,
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _selection(addresses: NDArray[np.int32]) -> Selection:
+    """A slice where the addresses are consecutive: a view instead of a copy."""
+    if (np.diff(addresses) == 1).all():
+        return slice(int(addresses[0]), int(addresses[-1]) + 1)
+    return addresses.astype(np.int64)
+
+
+def starting_qpos(
+    robot: RobotDescription, model: Model, position: Array, recording: Recording
+) -> Array:
+    """The configuration a recording starts in, shape (nq,).
+
+    On the ground the torso takes the IMU's first roll and pitch, or where there is none the tilt
+    that lays the feet flat, and the lowest point of the robot touches the floor.
+
+    Args:
+      robot: the robot.
+      model: its compiled model.
+      position: the joints' first positions, shape (n_joints,), rad.
+      recording: gives the IMU's first reading.
+    """
+    data = mujoco.MjData(model.compiled)
+    data.qpos[model.qpos] = position
+    if not model.floating:
+        return np.array(data.qpos)
+    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model.compiled, data)
+    roll, pitch = (
+        _first_known(recording.extras.get(f"imu/{angle}")) for angle in ("roll", "pitch")
+    )
+    if roll is None or pitch is None:
+        quaternion = _feet_flat(robot, model.compiled, data)
+    else:
+        quaternion = _from_roll_pitch(roll, pitch)
+    data.qpos[3:7] = quaternion
+    mujoco.mj_kinematics(model.compiled, data)
+    data.qpos[2] -= _lowest_point(model.compiled, data)
+    return np.array(data.qpos)
+
+
+def _first_known(values: Array | None) -> float | None:
+    if values is None or np.isnan(values).all():
+        return None
+    return float(values[np.argmax(~np.isnan(values))])
+
+
+def _from_roll_pitch(roll: float, pitch: float) -> Array:
+    """Z-Y-X Euler angles with no yaw to a quaternion (w, x, y, z)."""
+    cr, sr, cp, sp = np.cos(roll / 2), np.sin(roll / 2), np.cos(pitch / 2), np.sin(pitch / 2)
+    return np.array([cr * cp, sr * cp, cr * sp, -sr * sp])
+
+
+def _feet_flat(robot: RobotDescription, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """The torso's tilt that brings the mean upward axis of the feet to the vertical."""
+    if not robot.feet:
+        return np.array([1.0, 0, 0, 0])
+    up = np.mean(
+        [data.xmat[model.body(foot).id].reshape(3, 3)[:, 2] for foot in robot.feet], axis=0
+    )
+    up /= np.linalg.norm(up)
+    half = np.array([1 + up[2], up[1], -up[0], 0.0])  # shortest turn that takes `up` to z
+    return np.asarray(half / np.linalg.norm(half))
+
+
+def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Height of the lowest corner of the robot's colliding geoms, m."""
+    lowest = np.inf
+    for geom in range(model.ngeom):
+        collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
+        if model.geom_bodyid[geom] == 0 or not collides:
+            continue
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        row = data.geom_xmat[geom].reshape(3, 3)[2]
+        lowest = min(lowest, data.geom_xpos[geom, 2] + row @ centre - np.abs(row) @ half)
+    return float(lowest) if np.isfinite(lowest) else 0.0

@@ -1,0 +1,142 @@
+"""The replay protocol: recordings times candidate parameters in, trajectories out.
+
+Everything that asks what the robot would have done stands on it. A recording is first put on the
+engine's sub-step grid (`Schedule`), which knows nothing of ticks: targets become their mean over
+each sub-step, positions are interpolated back to the ticks, so any spacing of time is as good as
+another and a delay is a continuous parameter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.parameters import Candidates
+from pup.recording import Recording
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """One recording on a grid of sub-steps.
+
+    Attributes:
+      target: mean target of each sub-step, shape (n_steps, n_joints), rad.
+      power: share of each sub-step with the torque on, shape (n_steps,).
+      start: first joint position, shape (n_joints,), rad.
+      start_velocity: first joint velocity, shape (n_joints,), rad/s.
+      tick_step: sub-step in which each tick falls, shape (n_ticks,).
+      tick_fraction: where in it, 0 to 1, shape (n_ticks,).
+    """
+
+    target: Array
+    power: Array
+    start: Array
+    start_velocity: Array
+    tick_step: NDArray[np.int64]
+    tick_fraction: Array
+
+    @property
+    def steps(self) -> int:
+        """Number of sub-steps."""
+        return len(self.target)
+
+
+def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Schedule:
+    """Put a recording on a sub-step grid.
+
+    Args:
+      recording: its commands are held from row to row; a missing one holds the one before.
+      joints: the order of the joints.
+      timestep: sub-step, s.
+    """
+    order = [recording.joints.index(name) for name in joints]
+    elapsed = recording.time - recording.time[0]
+    where = elapsed / timestep + 1e-9  # ticks on the grid stay on it
+    step = where.astype(np.int64)
+    grid = np.arange(step[-1] + 2) * timestep
+    target = _held(recording.target[:, order])
+    power = _held(recording.extras.get("torque_enabled", np.ones(len(elapsed)))[:, None])
+    velocity = np.array([_first(recording.extras.get(f"velocity/{name}")) for name in joints])
+    return Schedule(
+        target=_mean_over_steps(elapsed, target, grid),
+        power=_mean_over_steps(elapsed, power, grid)[:, 0],
+        start=np.array([_first(recording.position[:, i]) for i in order]),
+        start_velocity=velocity,
+        tick_step=step,
+        tick_fraction=np.clip(where - step - 1e-9, 0.0, 1.0),
+    )
+
+
+def _held(values: Array) -> Array:
+    """Fill missing rows with the row before (the first rows with the first known value)."""
+    known = ~np.isnan(values)
+    rows = np.where(known, np.arange(len(values))[:, None], 0)
+    rows = np.maximum.accumulate(rows, axis=0)
+    first = np.argmax(known, axis=0)
+    return np.asarray(np.take_along_axis(values, np.maximum(rows, first), axis=0))
+
+
+def _first(values: Array | None) -> float:
+    """The first known value of a column, 0 where there is none."""
+    if values is None or np.isnan(values).all():
+        return 0.0
+    return float(values[np.argmax(~np.isnan(values))])
+
+
+def _mean_over_steps(time: Array, held: Array, grid: Array) -> Array:
+    """Mean over each grid cell of a signal (n_ticks, n) held from tick to tick."""
+    knots = np.append(time, max(grid[-1], time[-1]) + 1.0)
+    area = np.zeros((len(knots), held.shape[1]))
+    area[1:] = np.cumsum(np.diff(knots)[:, None] * held, axis=0)
+    at = np.stack([np.interp(grid, knots, column) for column in area.T], axis=1)
+    return np.diff(at, axis=0) / np.diff(grid)[:, None]
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """What the candidates did at the recordings' ticks.
+
+    Ticks of all recordings stand behind one another. Where a simulation has diverged, from that
+    tick on every value is NaN.
+
+    Attributes:
+      ticks: the ticks of each recording.
+      position: joint positions, shape (n_candidates, n_ticks, n_joints), rad.
+      tilt: torso roll and pitch, shape (n_candidates, n_ticks, 2), rad; NaN unless on the ground.
+      feet: foot positions, shape (n_candidates, n_ticks, n_feet, 3), m; NaN unless on the ground.
+    """
+
+    ticks: tuple[slice, ...]
+    position: Array
+    tilt: Array
+    feet: Array
+
+    @property
+    def diverged(self) -> NDArray[np.bool_]:
+        """Whether a candidate's simulation broke down, shape (n_candidates, n_recordings)."""
+        last = [np.isnan(self.position[:, part.stop - 1]).any(axis=-1) for part in self.ticks]
+        return np.stack(last, axis=1)
+
+
+def tick_slices(recordings: Sequence[Recording]) -> tuple[slice, ...]:
+    """Where each recording's ticks stand in packed arrays."""
+    ends = np.cumsum([len(r.time) for r in recordings])
+    return tuple(slice(int(e - len(r.time)), int(e)) for r, e in zip(recordings, ends, strict=True))
+
+
+class Simulator(Protocol):
+    """Replays one fixed set of recordings under any number of candidates."""
+
+    recordings: tuple[Recording, ...]
+
+    def replay(self, candidates: Candidates) -> Trajectories:
+        """Simulate every recording under every candidate.
+
+        A simulation that breaks down is reported in the trajectories, never raised. Results do
+        not depend on how candidates are grouped into calls.
+        """
+        ...

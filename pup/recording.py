@@ -1,0 +1,326 @@
+"""A recording: what a robot was told and what it did, one Parquet file each, read strictly.
+
+Columns are float64 in SI units and radians, one row per control tick, and time need not be uniform.
+A missing sample is null in the file and NaN in memory; a NaN in the file is refused.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.files import write_atomic
+from pup.recording_rules import (
+    SCHEMA,
+    check_extra,
+    check_joints,
+    check_metadata,
+    check_values,
+)
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+
+KEY = b"pup.recording"
+
+# A recording of an hour at 1 kHz with 6 columns has 22 million cells; real ones have thousands.
+MAX_FILE = 2**30  # bytes
+MAX_CELLS = 20_000_000
+MAX_COLUMNS = 4096
+MAX_UNPACKED = 2**31  # bytes, as the footer tells
+MAX_METADATA = 2**20  # bytes
+
+_CORE = ("time", "target", "position")
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One recording, complete and valid: making an invalid one raises `InputError`.
+
+    Attributes:
+      id: its name, unique within a set; also its file name without `.parquet`.
+      robot: name of the robot.
+      motion: motion type, such as `step` or `standup`.
+      support: `suspended`, `ground` or `bench`.
+      source: `hardware`, `simulation` or `unknown`.
+      joints: joint names in file order.
+      time: shape (n_ticks,), s, strictly increasing.
+      target: commands sent at `time` and held, shape (n_ticks, n_joints), rad.
+      position: encoder readings taken at `time`, shape (n_ticks, n_joints), rad.
+      extras: the other columns under their names in the file, each of shape (n_ticks,).
+      setup: what was knowingly changed for this recording, by the robot's knobs.
+      repeat_of: id of the recording this one repeats.
+      notes: free text.
+    """
+
+    id: str
+    robot: str
+    motion: str
+    support: str
+    source: str
+    joints: tuple[str, ...]
+    time: Array
+    target: Array
+    position: Array
+    extras: Mapping[str, Array] = field(default_factory=dict)
+    setup: Mapping[str, float] = field(default_factory=dict)
+    repeat_of: str | None = None
+    notes: str = ""
+
+    def __post_init__(self) -> None:
+        """Check everything and take read-only copies of the arrays."""
+        try:
+            if not isinstance(self.setup, Mapping):
+                raise InputError("metadata 'setup' is not an object of knobs and numbers")
+            check_metadata(self.metadata())
+            check_joints(tuple(self.joints))
+            own: dict[str, Any] = {"joints": tuple(self.joints)}
+            own |= {name: _frozen(name, getattr(self, name)) for name in _CORE}
+            own["extras"] = {name: _frozen(name, values) for name, values in self.extras.items()}
+            own["setup"] = {name: float(value) for name, value in self.setup.items()}
+            for name, value in own.items():
+                object.__setattr__(self, name, value)
+            self._check_shapes()
+            check_values(dict(self.columns()))
+        except InputError as error:
+            raise InputError(f"recording {self.id!r}: {error}") from error
+
+    def _check_shapes(self) -> None:
+        if self.time.ndim != 1:
+            raise InputError(f"column 'time' has shape {self.time.shape}; it must have one axis")
+        rows = (len(self.time),)
+        for name, values in (("target", self.target), ("position", self.position)):
+            if values.shape != (*rows, len(self.joints)):
+                raise InputError(
+                    f"{name} has shape {values.shape}; the time and joints given need "
+                    f"{(*rows, len(self.joints))}"
+                )
+        for name, values in self.extras.items():
+            check_extra(name, self.joints)
+            if values.shape != rows:
+                raise InputError(f"column {name!r} has shape {values.shape}, time has {rows}")
+
+    def columns(self) -> Iterator[tuple[str, Array]]:
+        """The columns of the file in order: time, targets, positions, the rest."""
+        yield "time", self.time
+        for kind in ("target", "position"):
+            values = getattr(self, kind)
+            yield from ((f"{kind}/{name}", values[:, j]) for j, name in enumerate(self.joints))
+        yield from self.extras.items()
+
+    def metadata(self) -> dict[str, Any]:
+        """What the file says of itself, as JSON values."""
+        return {
+            "schema": SCHEMA,
+            "id": self.id,
+            "robot": self.robot,
+            "motion": self.motion,
+            "support": self.support,
+            "setup": dict(self.setup),
+            "source": self.source,
+            "repeat_of": self.repeat_of,
+            "notes": self.notes,
+        }
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over metadata and columns, in hexadecimal; independent of the column order."""
+        digest = hashlib.sha256(json.dumps(self.metadata(), sort_keys=True).encode())
+        for name, values in sorted(self.columns()):
+            digest.update(f"\n{name}\n".encode())
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()
+
+    def validate(self, robot: RobotDescription) -> None:
+        """Check that the recording is of this robot: exactly its joints, and knobs it has.
+
+        Raises:
+          InputError: a joint or knob does not fit.
+        """
+        unknown = [name for name in self.joints if name not in robot.joint_names]
+        absent = [name for name in robot.joint_names if name not in self.joints]
+        if unknown or absent:
+            told = [f"unknown joints {', '.join(unknown)}"] if unknown else []
+            told += [f"joints {', '.join(absent)} not recorded"] if absent else []
+            raise InputError(
+                f"recording {self.id!r} (of robot {self.robot!r}): {' and '.join(told)} for robot "
+                f"{robot.name!r}; a recording must cover exactly the robot's joints"
+            )
+        try:
+            robot.setup(self.setup)
+        except InputError as error:
+            raise InputError(f"recording {self.id!r}: {error}") from error
+
+    def write(self, path: Path) -> None:
+        """Write the recording as Parquet, whole or not at all."""
+        columns = {n: pa.array(v, pa.float64(), mask=np.isnan(v)) for n, v in self.columns()}
+        table = pa.table(columns).replace_schema_metadata({KEY: json.dumps(self.metadata())})
+        buffer = io.BytesIO()
+        pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
+        write_atomic(path, buffer.getvalue())
+
+    @classmethod
+    def read(cls, path: Path) -> "Recording":
+        """Read a recording.
+
+        Raises:
+          InputError: the file breaks a rule; the message names file, column and row.
+        """
+        try:
+            metadata, columns = _read_parquet(path)
+            return from_columns(metadata, columns)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+
+def from_columns(metadata: object, columns: Mapping[str, Array]) -> Recording:
+    """Make a recording of named columns, as a file holds them.
+
+    Args:
+      metadata: the JSON object of the contract.
+      columns: contract name to values of shape (n_ticks,); NaN is a missing sample.
+
+    Raises:
+      InputError: something does not follow the contract.
+    """
+    known = check_metadata(metadata)
+    if "time" not in columns:
+        raise InputError("column 'time' is missing")
+    joints = tuple(name.split("/", 1)[1] for name in columns if name.startswith("target/"))
+    check_joints(joints)
+    measured = {name.split("/", 1)[1] for name in columns if name.startswith("position/")}
+    for name in joints:
+        if name not in measured:
+            raise InputError(f"column 'target/{name}' has no column 'position/{name}' beside it")
+    for name in sorted(measured.difference(joints)):
+        raise InputError(f"column 'position/{name}' has no column 'target/{name}' beside it")
+    core = {"time"} | {f"{kind}/{name}" for kind in ("target", "position") for name in joints}
+    for name in columns:
+        if name not in core:
+            check_extra(name, joints)
+    return Recording(
+        id=known["id"],
+        robot=known["robot"],
+        motion=known["motion"],
+        support=known["support"],
+        source=known["source"],
+        joints=joints,
+        time=columns["time"],
+        target=np.stack([columns[f"target/{name}"] for name in joints], axis=1),
+        position=np.stack([columns[f"position/{name}"] for name in joints], axis=1),
+        extras={name: values for name, values in columns.items() if name not in core},
+        setup=known.get("setup", {}),
+        repeat_of=known.get("repeat_of"),
+        notes=known.get("notes", ""),
+    )
+
+
+def load_recordings(paths: Sequence[Path]) -> tuple[Recording, ...]:
+    """Read recordings from files and folders, sorted by id.
+
+    Args:
+      paths: Parquet files, or folders that hold some.
+
+    Raises:
+      InputError: nothing found, an id stands twice, or a recording breaks a rule.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        found = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
+        if not found:
+            raise InputError(f"{path}: no *.parquet in this folder; see `pup import`")
+        files += found
+    if not files:
+        raise InputError("no recording given; name Parquet files or folders of them")
+    origin: dict[str, Path] = {}
+    recordings = []
+    for file in files:
+        recording = Recording.read(file)
+        if recording.id in origin:
+            raise InputError(
+                f"{file}: id {recording.id!r} is also that of {origin[recording.id]}; "
+                "every recording needs its own"
+            )
+        origin[recording.id] = file
+        recordings.append(recording)
+    return tuple(sorted(recordings, key=lambda recording: recording.id))
+
+
+def _frozen(name: str, values: object) -> Array:
+    """A read-only float64 copy in which every NaN has the same bits."""
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"column {name!r} is not made of numbers ({error})") from error
+    array[np.isnan(array)] = np.nan
+    array.setflags(write=False)
+    return array
+
+
+def _read_parquet(path: Path) -> tuple[object, dict[str, Array]]:
+    """Metadata and columns of a file, nulls as NaN; the footer is judged before data is read."""
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise InputError("not a file")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})") from error
+    if size > MAX_FILE:
+        raise InputError(f"{size} bytes; a recording has at most {MAX_FILE}")
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            _check_footer(file)
+            columns = {}
+            table = file.read(use_threads=False)
+            for name in table.column_names:
+                column = table.column(name)
+                values = column.to_numpy().astype(np.float64)
+                missing = column.is_null().to_numpy()
+                for row in np.flatnonzero(~np.isfinite(values) & ~missing):
+                    raise InputError(
+                        f"column {name!r}, row {row}: {values[row]}; a missing sample must be null"
+                    )
+                columns[name] = values
+            return _parse(file.schema_arrow.metadata[KEY]), columns
+    except InputError:
+        raise
+    except Exception as error:  # damaged files make pyarrow raise nearly anything
+        told = " ".join(str(error).split())[:200]
+        raise InputError(f"not a readable Parquet file ({told})") from error
+
+
+def _check_footer(file: Any) -> None:
+    footer, schema = file.metadata, file.schema_arrow
+    unpacked = sum(footer.row_group(i).total_byte_size for i in range(footer.num_row_groups))
+    rows, columns = footer.num_rows, footer.num_columns
+    if columns > MAX_COLUMNS or rows * columns > MAX_CELLS or unpacked > MAX_UNPACKED:
+        raise InputError(
+            f"{rows} rows of {columns} columns, {unpacked} bytes unpacked; a recording has at most "
+            f"{MAX_COLUMNS} columns, {MAX_CELLS} cells and {MAX_UNPACKED} bytes"
+        )
+    for name in schema.names:
+        if schema.names.count(name) > 1:
+            raise InputError(f"column {name!r} stands twice")
+        if schema.field(name).type != pa.float64():
+            raise InputError(f"column {name!r} is {schema.field(name).type}; it must be float64")
+    told = (schema.metadata or {}).get(KEY)
+    if told is None:
+        raise InputError("no metadata 'pup.recording': not a recording; see `pup import`")
+    if len(told) > MAX_METADATA:
+        raise InputError(f"metadata 'pup.recording' has {len(told)} bytes, over {MAX_METADATA}")
+
+
+def _parse(text: bytes) -> object:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"metadata 'pup.recording' is not JSON ({error})") from error

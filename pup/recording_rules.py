@@ -1,0 +1,133 @@
+"""The rules a recording keeps, and the messages of those it breaks.
+
+Rows are counted from 0. A message says what and where in the recording; the caller says in which.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+
+Array = NDArray[np.float64]
+
+SCHEMA = 1
+SUPPORTS = ("suspended", "ground", "bench")
+SOURCES = ("hardware", "simulation", "unknown")
+PER_JOINT = ("target", "position", "velocity", "current", "load", "temperature")
+IMU = tuple(f"imu/{sensor}_{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
+WHOLE = ("voltage", "torque_enabled", "imu/roll", "imu/pitch", "imu/yaw", *IMU)
+
+MAX_DURATION = 86_400.0  # s; longer means other units or a clock that jumped
+
+
+def check_metadata(metadata: object) -> dict[str, Any]:
+    """Check what a file says of itself; keys the contract does not know are let pass.
+
+    Args:
+      metadata: the JSON value under `pup.recording`.
+    """
+    if not isinstance(metadata, dict):
+        raise InputError("metadata 'pup.recording' is not a JSON object")
+    if type(metadata.get("schema")) is not int or metadata["schema"] != SCHEMA:
+        raise InputError(
+            f"metadata 'schema' is {metadata.get('schema')!r}; this version reads schema {SCHEMA}"
+        )
+    for key in ("id", "robot", "motion"):
+        if not isinstance(metadata.get(key), str) or not metadata[key]:
+            raise InputError(f"metadata {key!r} is {metadata.get(key)!r}; it must be a text")
+    check_id(metadata["id"])
+    for key, choices in (("support", SUPPORTS), ("source", SOURCES)):
+        if metadata.get(key) not in choices:
+            raise InputError(f"metadata {key!r} is {metadata.get(key)!r}; use {', '.join(choices)}")
+    _check_setup(metadata.get("setup", {}))
+    repeated = metadata.get("repeat_of")
+    if repeated is not None and (not isinstance(repeated, str) or not repeated):
+        raise InputError(f"metadata 'repeat_of' is {repeated!r}; use an id or null")
+    if not isinstance(metadata.get("notes", ""), str):
+        raise InputError("metadata 'notes' is not a text")
+    return metadata
+
+
+def check_id(name: str) -> None:
+    """Check an id: it becomes a file name, so nothing in it may lead out of the folder."""
+    if not name.isprintable() or "/" in name or "\\" in name:
+        raise InputError(f"metadata 'id' {name!r} holds a slash or a control character")
+    if name.startswith(".") or len(name) > 120:
+        raise InputError(f"metadata 'id' {name!r} begins with a dot or is over 120 characters")
+
+
+def check_joints(joints: tuple[str, ...]) -> None:
+    """Check that there are joints and each has a name of its own."""
+    if not joints:
+        raise InputError("no target: there is no column target/<joint>")
+    seen: set[str] = set()
+    for name in joints:
+        if not isinstance(name, str) or not name or not name.isprintable() or name in seen:
+            raise InputError(f"joint {name!r} is no name, or stands twice")
+        seen.add(name)
+
+
+def check_extra(name: str, joints: tuple[str, ...]) -> None:
+    """Check the name of a column other than time, targets and positions."""
+    kind, _, joint = name.partition("/")
+    if name in WHOLE:
+        return
+    if kind not in PER_JOINT:
+        raise InputError(f"column {name!r} is not one a recording can have")
+    if joint not in joints or kind in ("target", "position"):
+        raise InputError(f"column {name!r} is of a joint without target and position")
+
+
+def check_values(columns: Mapping[str, Array]) -> None:
+    """Check the samples.
+
+    Args:
+      columns: contract name to values of shape (n_ticks,); NaN is a missing sample.
+    """
+    for name, values in columns.items():
+        for row in np.flatnonzero(np.isinf(values)):
+            raise InputError(f"column {name!r}, row {row}: infinite")
+        needed = name.startswith(("target/", "position/", "torque_enabled"))
+        if needed and np.isnan(values).all():
+            raise InputError(f"column {name!r} has no sample at all")
+    _check_time(columns["time"])
+    power = columns.get("torque_enabled", np.ones(0))
+    for row in np.flatnonzero(~np.isnan(power) & (power != 0) & (power != 1)):
+        raise InputError(f"column 'torque_enabled', row {row}: {power[row]:g} is neither 0 nor 1")
+
+
+def _check_time(time: Array) -> None:
+    if len(time) < 2:
+        raise InputError(f"column 'time' has {len(time)} rows; a recording needs at least two")
+    for row in np.flatnonzero(np.isnan(time)):
+        raise InputError(f"column 'time', row {row}: missing; every row needs its time")
+    for row in np.flatnonzero(np.diff(time) <= 0) + 1:
+        which = "repeats" if time[row] == time[row - 1] else "is before"
+        raise InputError(
+            f"column 'time', row {row}: {time[row]:.9g} s {which} {time[row - 1]:.9g} s of the "
+            "row before; time must increase strictly"
+        )
+    if not time[-1] - time[0] <= MAX_DURATION:
+        raise InputError(
+            f"column 'time' spans {time[-1] - time[0]:g} s; is it in seconds, did the clock jump?"
+        )
+
+
+def _check_setup(setup: object) -> None:
+    if not isinstance(setup, dict):
+        raise InputError("metadata 'setup' is not an object of knobs and numbers")
+    for knob, value in setup.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not isinstance(knob, str) or not number or not _is_finite(value):
+            raise InputError(f"metadata 'setup': {knob!r} is {value!r}; use a finite number")
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond float64
+        return False

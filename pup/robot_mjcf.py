@@ -1,0 +1,149 @@
+"""The names in an MJCF file, read without a simulator and without trusting the file."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pup.errors import InputError
+from pup.robot_toml import read_text
+
+MJCF_LIMIT = 16 * 2**20  # bytes, each file
+FOLDER_KEYS = ("assetdir", "meshdir", "texturedir")
+
+
+@dataclass(frozen=True)
+class MjcfNames:
+    """What an MJCF model calls its parts.
+
+    Attributes:
+      joints: hinge and slide joints, in file order.
+      bodies: named bodies.
+      geoms: named geoms.
+      sites: named sites.
+      floating: the body that carries the free joint; None for a fixed base.
+      texts: the XML files read, the model first, then its includes.
+    """
+
+    joints: tuple[str, ...]
+    bodies: frozenset[str]
+    geoms: frozenset[str]
+    sites: frozenset[str]
+    floating: str | None
+    texts: tuple[str, ...]
+
+
+def read_mjcf(path: Path) -> MjcfNames:
+    """Read the names of an MJCF model and of the files it includes.
+
+    Raises:
+      InputError: not XML, too large, a document type, a file outside the model's folder, a joint
+        without a name, of a kind other than hinge or slide, or a second free joint.
+    """
+    texts: list[str] = []
+    root = _parse(path, texts)
+    _splice_includes(root, path, texts)
+    _check_files(root, path)
+    joints: list[str] = []
+    floating: list[str] = []
+    names: dict[str, set[str]] = {"body": set(), "geom": set(), "site": set()}
+    for element, body in _world(root):
+        name = element.get("name", "")
+        if element.tag in names and name:
+            names[element.tag].add(name)
+        elif element.tag == "freejoint" or (element.tag == "joint" and _type(element) == "free"):
+            floating.append(body)
+        elif element.tag == "joint":
+            if not name:
+                raise InputError(f"{path}: a joint of body {body!r} has no name; name every joint")
+            joints.append(name)
+    for element in root.iter("joint"):
+        if _type(element) not in ("hinge", "slide", "free"):
+            raise InputError(
+                f"{path}: joint {element.get('name')!r} is of type {_type(element)!r}; "
+                "only hinge and slide joints can be driven"
+            )
+    if len(floating) > 1:
+        raise InputError(f"{path}: more than one free joint ({', '.join(floating)}); keep one")
+    return MjcfNames(
+        joints=tuple(joints),
+        bodies=frozenset(names["body"]),
+        geoms=frozenset(names["geom"]),
+        sites=frozenset(names["site"]),
+        floating=floating[0] if floating else None,
+        texts=tuple(texts),
+    )
+
+
+def absent(kind: str, name: str) -> str:
+    """What to say of a name the model does not have."""
+    return f"model.xml has no {kind} {name!r}; correct the name or add it there"
+
+
+def _type(joint: ElementTree.Element) -> str:
+    return joint.get("type", "hinge")
+
+
+def _parse(path: Path, texts: list[str]) -> ElementTree.Element:
+    text = read_text(path, MJCF_LIMIT)
+    # An MJCF needs no document type, and entities are how an XML file of a few bytes grows to
+    # gigabytes. The text is parsed decoded, so that no declared encoding can hide one.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{path}: document types and entities are not accepted; remove <!DOCTYPE>")
+    texts.append(text)
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path}: not an XML document ({error})") from error
+
+
+def _inside(model: Path, file: str) -> Path:
+    """The path of a file named in a model, which must lie in the model's folder."""
+    folder = model.parent.resolve()
+    target = (folder / file).resolve()
+    if not target.is_relative_to(folder):
+        raise InputError(f"{model}: file {file!r} lies outside the robot's folder; copy it there")
+    return target
+
+
+def _splice_includes(root: ElementTree.Element, model: Path, texts: list[str]) -> None:
+    """Replace every <include> by the children of the file it names, as MuJoCo does."""
+    seen = {model.resolve()}
+    waiting = [root]
+    while waiting:
+        element = waiting.pop()
+        position = 0
+        while position < len(element):
+            child = element[position]
+            if child.tag != "include":
+                waiting.append(child)
+                position += 1
+                continue
+            file = _inside(model, child.get("file", ""))
+            if file in seen:
+                raise InputError(f"{model}: includes {file.name!r} twice; include each file once")
+            seen.add(file)
+            element[position : position + 1] = list(_parse(file, texts))
+
+
+def _check_files(root: ElementTree.Element, model: Path) -> None:
+    """Refuse meshes, textures and other files outside the model's folder."""
+    folders = {key: "" for key in FOLDER_KEYS}
+    for compiler in root.iter("compiler"):
+        folders.update({key: compiler.get(key, folders[key]) for key in FOLDER_KEYS})
+    for element in root.iter():
+        for attribute, file in element.items():
+            if attribute.startswith("file"):
+                for folder in ("", *folders.values()):
+                    _inside(model, f"{folder}/{file}" if folder else file)
+
+
+def _world(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
+    """Every element below the world, in file order, with the name of the body it belongs to."""
+    waiting = [(child, "world") for world in root.findall("worldbody") for child in world]
+    waiting.reverse()
+    while waiting:
+        element, body = waiting.pop()
+        yield element, body
+        inner = element.get("name", "") if element.tag == "body" else body
+        waiting.extend((child, inner) for child in reversed(element))

@@ -1,0 +1,1 @@
+"""Identification of model parameters from recordings."""

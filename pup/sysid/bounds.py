@@ -1,0 +1,143 @@
+"""Algorithm 1 of the paper: ranges of parameters from fits to random subsets of recordings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.parameters import ParameterSpace
+
+Array = NDArray[np.float64]
+
+EXPANSION = 0.1
+"""The range grows by this share of its width at both ends (paper, Algorithm 1)."""
+PERMUTATIONS = 10_000
+SPLIT_LEVEL = 0.05
+
+
+def draw_subsets(count: int, subsets: int, fraction: float, seed: int) -> list[tuple[int, ...]]:
+    """Random subsets of recordings, drawn without replacement within each.
+
+    Args:
+      count: number of recordings.
+      subsets: how many subsets.
+      fraction: share of the recordings in each; at least two are drawn.
+      seed: of the draw.
+    """
+    rng = np.random.default_rng(seed)
+    size = min(count, max(2, round(count * fraction)))
+    return [tuple(sorted(map(int, rng.permutation(count)[:size]))) for _ in range(subsets)]
+
+
+def expanded_range(fits: Array, space: ParameterSpace) -> tuple[Array, Array]:
+    """Per-parameter range of the subset fits, expanded by 10 % and kept in the search range.
+
+    Args:
+      fits: physical values, shape (n_subsets, n_parameters).
+      space: their space.
+
+    Returns:
+      Lower and upper bounds, shape (n_parameters,) each.
+    """
+    low, high = fits.min(axis=0), fits.max(axis=0)
+    margin = EXPANSION * (high - low)
+    return np.maximum(low - margin, space.lower), np.minimum(high + margin, space.upper)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Whether a parameter takes other values where subsets contain contact.
+
+    Attributes:
+      name: the parameter.
+      with_contact: its values in the subsets with contact, physical.
+      without: its values in those without.
+      separation: difference of the two means over the pooled standard deviation.
+      p_value: of the difference, by permuting the labels and corrected for the number of
+        parameters looked at (family-wise, largest statistic); NaN when a side has under two fits.
+      two_clusters: p-value of the values being one cluster against two, labels unseen.
+    """
+
+    name: str
+    with_contact: Array
+    without: Array
+    separation: float
+    p_value: float
+    two_clusters: float
+
+    @property
+    def split(self) -> bool:
+        """Whether the difference is significant."""
+        return bool(self.p_value < SPLIT_LEVEL)
+
+
+def contact_splits(
+    fits: Array, space: ParameterSpace, contact: Sequence[bool], seed: int = 0
+) -> list[Split]:
+    """Test each parameter for a split between subsets with and without contact.
+
+    The paper saw one in the torque limit and took it for a sign of missing physics (section V-E).
+
+    Args:
+      fits: physical values, shape (n_subsets, n_parameters).
+      space: their space.
+      contact: whether each subset contains a recording on the ground.
+      seed: of the permutations.
+    """
+    unit = space.normalise(fits)
+    label = np.asarray(contact, dtype=bool)
+    rng = np.random.default_rng(seed)
+    testable = 2 <= label.sum() <= len(label) - 2
+    observed = _separation(unit, label) if testable else np.full(len(space), np.nan)
+    p_values = np.full(len(space), np.nan)
+    if testable:
+        shuffled = (rng.permutation(label) for _ in range(PERMUTATIONS))
+        largest = np.array([np.abs(_separation(unit, s)).max() for s in shuffled])
+        p_values = np.array(
+            [(1 + (largest >= abs(o) - 1e-12).sum()) / (1 + PERMUTATIONS) for o in observed]
+        )
+    return [
+        Split(
+            name,
+            fits[label, i],
+            fits[~label, i],
+            float(observed[i]),
+            float(p_values[i]),
+            two_cluster_p(unit[:, i], rng),
+        )
+        for i, name in enumerate(space.names)
+    ]
+
+
+def _separation(unit: Array, label: NDArray[np.bool_]) -> Array:
+    """Difference of the two means over the pooled standard deviation, per parameter."""
+    a, b = unit[label], unit[~label]
+    pooled = np.sqrt((a.var(axis=0) * len(a) + b.var(axis=0) * len(b)) / len(unit))
+    return np.asarray((a.mean(axis=0) - b.mean(axis=0)) / np.maximum(pooled, 1e-3))
+
+
+def two_cluster_p(values: Array, rng: np.random.Generator, draws: int = 2000) -> float:
+    """P-value of one cluster against two, labels unseen.
+
+    The statistic is the share of the variance that the best split in two leaves; its null is a
+    normal sample of the same size (a uniform or normal cloud is one cluster).
+
+    Args:
+      values: shape (n,).
+      rng: for the null's draws.
+      draws: how many.
+    """
+    if len(values) < 4 or np.ptp(values) < 1e-9:
+        return 1.0
+    null = np.array([_left_by_two(sample) for sample in rng.normal(size=(draws, len(values)))])
+    return float((1 + (null <= _left_by_two(values)).sum()) / (1 + draws))
+
+
+def _left_by_two(values: Array) -> float:
+    """Within-cluster share of the variance under the best split of sorted values in two."""
+    x = np.sort(values)
+    n = np.arange(1, len(x))
+    left, total = np.cumsum(x)[:-1], x.sum()
+    between = left**2 / n + (total - left) ** 2 / (len(x) - n) - total**2 / len(x)
+    return float(1 - between.max() / max(((x - x.mean()) ** 2).sum(), 1e-300))

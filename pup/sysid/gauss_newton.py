@@ -1,0 +1,181 @@
+"""Levenberg-Marquardt on batched finite differences, with bounds, priors and confidence.
+
+One iteration is two batches: the Jacobian's columns are candidates of one replay, and so are the
+trial steps, tried at many dampings at once. That is what makes it the quick fitter: the number of
+replays does not grow with the number of parameters.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pup.physics.parameters import ParameterSpace
+
+Array = NDArray[np.float64]
+Residuals = Callable[[Array], Array]
+"""Candidates (n, n_parameters) on the unit cube to weighted residuals (n, n_residuals)."""
+
+STEP = 0.01
+"""Finite-difference step on the unit cube: wide enough to smooth what friction and ticks kink."""
+DAMPINGS = 10.0 ** np.arange(-3.0, 2.0)
+"""Damping factors tried at once, relative to the current one."""
+IDENTIFIED_SHARE = 0.5
+"""A parameter is identified when its 90 % interval covers at most this share of its range."""
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Outcome of a least-squares fit.
+
+    Attributes:
+      best: on the unit cube, shape (n_parameters,).
+      cost: half the sum of squared residuals there, the prior's included.
+      converged: whether it stopped because no step improves any more.
+      replays: candidates simulated.
+      covariance: of the parameters on the unit cube, shape (n_parameters, n_parameters), with a
+        unit-cube-wide uniform prior, so that what the data do not see stays finite.
+      noise: residual standard deviation, in the residuals' unit.
+    """
+
+    best: Array
+    cost: float
+    converged: bool
+    replays: int
+    covariance: Array
+    noise: float
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Intervals and correlations of a fit's parameters, in the units of their space.
+
+    Attributes:
+      lower: lower ends of the 90 % intervals, clipped to the search range.
+      upper: upper ends.
+      correlation: shape (n_parameters, n_parameters).
+      identified: whether the data narrow each parameter to less than IDENTIFIED_SHARE of its range.
+    """
+
+    lower: Array
+    upper: Array
+    correlation: Array
+    identified: NDArray[np.bool_]
+
+
+def least_squares(
+    residuals: Residuals,
+    start: Array,
+    *,
+    iterations: int = 30,
+    prior_mean: Array | None = None,
+    prior_sd: Array | None = None,
+    tolerance: float = 1e-4,
+) -> LeastSquares:
+    """Minimise the sum of squared residuals over the unit cube.
+
+    Args:
+      residuals: weighted residuals of a batch of candidates; must not be NaN.
+      start: shape (n_parameters,), on the unit cube.
+      iterations: at most this many Jacobians.
+      prior_mean: centre of a Gaussian prior on the unit cube, shape (n_parameters,).
+      prior_sd: its standard deviations in units of the cube, for residuals of unit variance;
+        infinite where there is none.
+      tolerance: relative improvement of the cost below which it stops.
+    """
+    prior = _Prior(start, prior_mean, prior_sd)
+    at = np.clip(start, 0.0, 1.0)
+    value = residuals(at[None])[0]
+    cost = prior.cost(value, at)
+    damping, replays, converged = 1e-2, 1, False
+    jacobian = np.empty((0, 0))
+    for _ in range(iterations):
+        jacobian = _jacobian(residuals, at, value)
+        replays += len(at)
+        trials, factors = _trial_steps(jacobian, value, at, damping, prior)
+        values = residuals(trials)
+        replays += len(trials)
+        costs = np.array([prior.cost(v, t) for v, t in zip(values, trials, strict=True)])
+        pick = int(np.argmin(costs))
+        improvement = cost - costs[pick]
+        if improvement <= tolerance * cost:
+            if improvement > 0:
+                at, value, cost = trials[pick], values[pick], float(costs[pick])
+            if factors[pick] >= 1.0 or improvement > 0 or damping > 1e6:
+                converged = True
+                break
+            damping *= 1e3
+            continue
+        at, value, cost = trials[pick], values[pick], float(costs[pick])
+        damping = float(np.clip(damping * factors[pick], 1e-9, 1e9))
+    jacobian = _jacobian(residuals, at, value)
+    freedom = max(1, len(value) - len(at))
+    noise = float(np.sqrt(value @ value / freedom))
+    covariance = _covariance(jacobian, noise, prior)
+    return LeastSquares(at, float(cost), converged, replays + len(at), covariance, noise)
+
+
+def confidence(space: ParameterSpace, fit: LeastSquares) -> Confidence:
+    """90 % intervals and correlations of a fit, assuming the model right."""
+    sd = np.sqrt(np.diag(fit.covariance))
+    reach = stats.norm.ppf(0.95) * sd
+    correlation = fit.covariance / np.maximum(np.outer(sd, sd), 1e-300)
+    return Confidence(
+        space.denormalise(np.clip(fit.best - reach, 0, 1)),
+        space.denormalise(np.clip(fit.best + reach, 0, 1)),
+        correlation,
+        2 * reach <= IDENTIFIED_SHARE,
+    )
+
+
+class _Prior:
+    """A Gaussian prior as extra residuals."""
+
+    def __init__(self, start: Array, mean: Array | None, sd: Array | None) -> None:
+        self.mean = start if mean is None else mean
+        self.weight = np.zeros(len(start)) if sd is None else 1.0 / sd
+
+    def cost(self, value: Array, at: Array) -> float:
+        pull = self.weight * (at - self.mean)
+        return float(value @ value + pull @ pull) / 2
+
+
+def _jacobian(residuals: Residuals, at: Array, value: Array) -> Array:
+    """One-sided differences into the cube, one batch; shape (n_residuals, n_parameters)."""
+    step = np.where(at + STEP <= 1.0, STEP, -STEP)
+    moved = at + np.diag(step)
+    return np.asarray(((residuals(moved) - value) / step[:, None]).T)
+
+
+def _trial_steps(
+    jacobian: Array, value: Array, at: Array, damping: float, prior: _Prior
+) -> tuple[Array, Array]:
+    """Damped Gauss-Newton steps, those against a wall left out of the system."""
+    normal = jacobian.T @ jacobian + np.diag(prior.weight**2)
+    gradient = jacobian.T @ value + prior.weight**2 * (at - prior.mean)
+    scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.diag(normal).max()), 1e-300))
+    trials = []
+    for factor in DAMPINGS:
+        free = ~(((at <= 0) & (gradient > 0)) | ((at >= 1) & (gradient < 0)))
+        trial = at
+        for _ in range(3):  # a step into a wall is taken again along it
+            step = np.zeros(len(at))
+            system = normal + damping * factor * np.diag(scale)
+            if free.any():
+                step[free] = -np.linalg.solve(system[np.ix_(free, free)], gradient[free])
+            trial = at + step
+            beyond = free & (((trial < 0) & (at <= 0)) | ((trial > 1) & (at >= 1)))
+            if not beyond.any():
+                break
+            free &= ~beyond
+        trials.append(np.clip(trial, 0.0, 1.0))
+    return np.array(trials), DAMPINGS
+
+
+def _covariance(jacobian: Array, noise: float, prior: _Prior) -> Array:
+    """Inverse of the information, with the variance of a uniform unit prior (12) as a floor."""
+    information = jacobian.T @ jacobian / max(noise, 1e-12) ** 2
+    information += np.diag(prior.weight**2 + 12.0)
+    return np.asarray(np.linalg.inv(information))

@@ -1,0 +1,155 @@
+"""The paper's loss between recordings and their replay (equation 1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.simulator import Trajectories, tick_slices
+from pup.recording import Recording
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+
+TILT_WEIGHT = 10.0
+FEET_WEIGHT = 20.0
+STANDING = frozenset(("stand", "standup"))
+"""Motion types whose feet stay where they are: the set D_s of the paper."""
+FALLING = frozenset(("fall",))
+
+LOST_POSITION = np.pi
+"""Error counted per joint or angle of a simulation that broke down, rad."""
+LOST_FOOT = 1.0
+"""The same for a foot, m."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The three sums over time, per candidate and recording.
+
+    Attributes:
+      position: sum over ticks of the norm of the joint position error, shape (n_candidates,
+        n_recordings).
+      tilt: the same of the torso's roll and pitch; 0 where a recording has none.
+      feet: the same of the feet's distance from where they started; 0 unless standing.
+    """
+
+    position: Array
+    tilt: Array
+    feet: Array
+
+
+class ReplayLoss:
+    """Compares trajectories with the recordings they replay.
+
+    Args:
+      robot: gives the order of the joints.
+      recordings: the measurements, in the order of the trajectories.
+    """
+
+    def __init__(self, robot: RobotDescription, recordings: Sequence[Recording]) -> None:
+        self.recordings = tuple(recordings)
+        self.ticks = tick_slices(recordings)
+        self.position = np.concatenate(
+            [r.position[:, [r.joints.index(n) for n in robot.joint_names]] for r in recordings]
+        )
+        self.tilt = np.concatenate([_tilt(r) for r in recordings])
+        motions = [r.motion for r in recordings]
+        ground = np.array([r.support == "ground" for r in recordings])
+        self.standing = ground & np.array([m in STANDING for m in motions])
+        moving = np.array([m in STANDING | FALLING for m in motions])
+        measured = [not np.isnan(self.tilt[part]).all() for part in self.ticks]
+        self.tilting = ground & moving & np.array(measured)
+        self.starts = np.array([part.start for part in self.ticks])
+
+    def terms(self, trajectories: Trajectories) -> Terms:
+        """The three sums, per candidate and recording."""
+        first = np.repeat(self.starts, [p.stop - p.start for p in self.ticks])
+        moved = trajectories.feet - trajectories.feet[:, first]
+        still = np.zeros(moved[0, 0].size)
+        return Terms(
+            self._sum(_length(_difference(trajectories.position, self.position, LOST_POSITION))),
+            self._sum(_length(self._tilt_error(trajectories))) * self.tilting,
+            self._sum(_length(_difference(_flat(moved), still, LOST_FOOT))) * self.standing,
+        )
+
+    def total(self, terms: Terms, subset: Sequence[int] | None = None) -> Array:
+        """Equation 1 over all recordings or a subset of them, shape (n_candidates,)."""
+        chosen = np.arange(len(self.recordings)) if subset is None else np.asarray(subset)
+        tilting, standing = chosen[self.tilting[chosen]], chosen[self.standing[chosen]]
+        loss = terms.position[:, chosen].mean(axis=1)
+        if len(tilting):
+            loss = loss + TILT_WEIGHT * terms.tilt[:, tilting].mean(axis=1)
+        if len(standing):
+            loss = loss + FEET_WEIGHT * terms.feet[:, standing].mean(axis=1)
+        return np.asarray(loss)
+
+    def omitted(self) -> list[str]:
+        """What the recordings lack of equation 1, in words."""
+        lines = []
+        wanted = [
+            r for r in self.recordings if r.support == "ground" and r.motion in STANDING | FALLING
+        ]
+        without = [
+            r.id
+            for r, has in zip(self.recordings, self.tilting, strict=True)
+            if r in wanted and not has
+        ]
+        if without:
+            lines.append(
+                f"no torso roll and pitch in {', '.join(without)}: tilt term left out there"
+            )
+        if not wanted:
+            lines.append("no standing or falling recording: tilt and foot terms left out")
+        elif not self.standing.any():
+            lines.append("no standing recording: foot term left out")
+        return lines
+
+    def rmse(self, trajectories: Trajectories) -> Array:
+        """Root mean square joint error per candidate, recording and joint, rad.
+
+        Shape (n_candidates, n_recordings, n_joints); NaN for a joint that was never read.
+        """
+        error = _difference(trajectories.position, self.position, LOST_POSITION)
+        square = [np.nanmean(error[:, part] ** 2, axis=1) for part in self.ticks]
+        return np.asarray(np.sqrt(np.stack(square, axis=1)))
+
+    def errors(self, trajectories: Trajectories) -> tuple[Array, Array]:
+        """Joint errors (n, n_ticks, n_joints) and tilt errors (n, n_ticks, 2), rad.
+
+        Zero where nothing was measured.
+        """
+        position = _difference(trajectories.position, self.position, LOST_POSITION)
+        tilt = self._tilt_error(trajectories)
+        counts = np.repeat(self.tilting, [p.stop - p.start for p in self.ticks])
+        return np.nan_to_num(position), np.where(counts[:, None], np.nan_to_num(tilt), 0.0)
+
+    def _tilt_error(self, trajectories: Trajectories) -> Array:
+        """Errors of roll and pitch, the short way round the circle."""
+        error = _difference(trajectories.tilt, self.tilt, LOST_POSITION)
+        return (error + np.pi) % (2 * np.pi) - np.pi
+
+    def _sum(self, values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, self.starts, axis=1))
+
+
+def _tilt(recording: Recording) -> Array:
+    absent = np.full(len(recording.time), np.nan)
+    angles = [recording.extras.get(f"imu/{name}", absent) for name in ("roll", "pitch")]
+    return np.stack(angles, axis=1)
+
+
+def _flat(values: Array) -> Array:
+    return values.reshape(*values.shape[:2], -1)
+
+
+def _difference(simulated: Array, measured: Array, lost: float) -> Array:
+    """Error where measured, `lost` where the simulation broke down, NaN where not measured."""
+    error = simulated - measured
+    return np.where(np.isnan(error) & ~np.isnan(measured), lost, error)
+
+
+def _length(error: Array) -> Array:
+    """Euclidean norm over the last axis; what was not measured counts zero."""
+    return np.asarray(np.sqrt(np.nansum(error**2, axis=-1)))

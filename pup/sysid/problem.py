@@ -1,0 +1,98 @@
+"""What a fit evaluates: recordings, a torque law, and the parameters that are free."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.mujoco_batch import MujocoSimulator
+from pup.physics.parameters import ParameterSpace
+from pup.physics.simulator import Trajectories
+from pup.recording import Recording
+from pup.robot import Actuator, RobotDescription
+from pup.sysid.loss import TILT_WEIGHT, ReplayLoss
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Recordings and a model to be fitted to them.
+
+    Candidates are given on the unit cube of the free parameters; the others keep the nominal
+    values of the space.
+
+    Attributes:
+      robot: the robot.
+      recordings: what is fitted.
+      actuator: torque law.
+      space: all parameters of the torque law.
+      free: names of those to be fitted.
+      threads: batches that run at once.
+    """
+
+    robot: RobotDescription
+    recordings: tuple[Recording, ...]
+    actuator: Actuator
+    space: ParameterSpace
+    free: tuple[str, ...]
+    threads: int = 1
+
+    def of(self, subset: Sequence[int]) -> "Problem":
+        """The same model for some of the recordings."""
+        return replace(self, recordings=tuple(self.recordings[i] for i in subset))
+
+    @cached_property
+    def digest(self) -> str:
+        """Identifies what is evaluated, however many threads do it."""
+        parts = [self.robot.digest, self.actuator, *self.free, *self.space.names]
+        parts += [
+            repr(a.tolist()) for a in (self.space.nominal, self.space.lower, self.space.upper)
+        ]
+        parts += [recording.digest for recording in self.recordings]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    @cached_property
+    def free_space(self) -> ParameterSpace:
+        """The free parameters."""
+        return self.space.select(self.free)
+
+    @cached_property
+    def loss(self) -> ReplayLoss:
+        """Equation 1 over the recordings."""
+        return ReplayLoss(self.robot, self.recordings)
+
+    @cached_property
+    def _simulator(self) -> MujocoSimulator:
+        return MujocoSimulator(self.robot, self.recordings, self.actuator, self.threads)
+
+    def values(self, unit: Array) -> Array:
+        """All parameters, physical (n, n_all), of candidates (n, n_free) on the unit cube."""
+        values = np.tile(self.space.nominal, (len(unit), 1))
+        values[:, [self.space.names.index(n) for n in self.free]] = self.free_space.denormalise(
+            unit
+        )
+        return values
+
+    def replay(self, unit: Array) -> Trajectories:
+        """Replay candidates (n, n_free) on the unit cube."""
+        return self._simulator.replay(self.space.candidates(self.values(unit)))
+
+    def losses(self, unit: Array) -> Array:
+        """Equation 1 of candidates (n, n_free), shape (n,)."""
+        return self.loss.total(self.loss.terms(self.replay(unit)))
+
+    def residuals(self, unit: Array) -> Array:
+        """Position and tilt errors of candidates (n, n_free), shape (n, n_residuals).
+
+        The tilt has its weight in equation 1; a value that was not measured counts zero, one of a
+        broken simulation as in the loss.
+        """
+        trajectories = self.replay(unit)
+        position, tilt = self.loss.errors(trajectories)
+        return np.concatenate(
+            [position.reshape(len(unit), -1), TILT_WEIGHT * tilt.reshape(len(unit), -1)], axis=1
+        )

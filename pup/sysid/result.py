@@ -1,0 +1,176 @@
+"""The outcome of pre-sysID and its file, `bounds.json` (CONTRACTS.md, section 4)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.files import read_json, write_json
+from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
+from pup.robot import Actuator, RobotDescription
+from pup.sysid.bounds import Split
+
+Array = NDArray[np.float64]
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class SubsetFit:
+    """One subset's fit.
+
+    Attributes:
+      recordings: ids of the subset.
+      contact: whether any of them is on the ground.
+      loss: equation 1 over the subset, without the regulariser.
+      values: fitted bounded parameters, physical, shape (n_parameters,).
+    """
+
+    recordings: tuple[str, ...]
+    contact: bool
+    loss: float
+    values: Array
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What pre-sysID found.
+
+    Attributes:
+      robot: name of the robot.
+      actuator: torque law of the fit, `nn_pd` or `pd`.
+      space: the bounded parameters (14 for the Darwin OP2).
+      nominal: their nominal fit, physical, shape (n_parameters,).
+      lower: lower bounds of Algorithm 1.
+      upper: upper bounds.
+      ci90: 90 % intervals of the nominal fit, shape (n_parameters, 2).
+      identified: whether the recordings determine each parameter, shape (n_parameters,).
+      correlation: of the bounded parameters, shape (n_parameters, n_parameters).
+      weights: the network's weights, shape (27,); empty for `pd`.
+      train: measures of the nominal fit on the recordings it saw: `loss`, `rmse`.
+      held_out: the same on recordings left out, or None.
+      subsets: the subset fits.
+      splits: parameters tested for a split between subsets with and without contact.
+      histories: best objective per generation of the nominal fit of each actuator.
+      omitted: what of equation 1 the recordings could not give, in words.
+      provenance: how it came about.
+    """
+
+    robot: str
+    actuator: Actuator
+    space: ParameterSpace
+    nominal: Array
+    lower: Array
+    upper: Array
+    ci90: Array
+    identified: NDArray[np.bool_]
+    correlation: Array
+    weights: Array
+    train: dict[str, float]
+    held_out: dict[str, float] | None
+    subsets: tuple[SubsetFit, ...]
+    splits: tuple[Split, ...]
+    histories: dict[str, Array]
+    omitted: tuple[str, ...]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, path: Path) -> None:
+        """Write `bounds.json`."""
+        write_json(path, self.document())
+
+    def document(self) -> dict[str, Any]:
+        """The JSON document."""
+        return {
+            "schema": SCHEMA,
+            "robot": self.robot,
+            "parameters": [self._parameter(i) for i in range(len(self.space))],
+            "actuator": {"kind": self.actuator, "weights": self.weights.tolist()},
+            "loss": {"train": self.train, "held_out": self.held_out},
+            "subsets": [
+                {
+                    "recordings": list(s.recordings),
+                    "contact": s.contact,
+                    "loss": s.loss,
+                    "parameters": self._named(s.values),
+                }
+                for s in self.subsets
+            ],
+            "correlation": self.correlation.tolist(),
+            "splits": [_split(s) for s in self.splits],
+            "histories": {name: values.tolist() for name, values in self.histories.items()},
+            "omitted": list(self.omitted),
+            "provenance": self.provenance,
+        }
+
+    def _named(self, values: Array) -> dict[str, float]:
+        return dict(zip(self.space.names, map(float, values), strict=True))
+
+    def _parameter(self, i: int) -> dict[str, Any]:
+        return {
+            "name": self.space.names[i],
+            "unit": self.space.units[i],
+            "nominal": float(self.nominal[i]),
+            "lower": float(self.lower[i]),
+            "upper": float(self.upper[i]),
+            "search": [float(self.space.lower[i]), float(self.space.upper[i])],
+            "ci90": [float(v) for v in self.ci90[i]],
+            "identified": bool(self.identified[i]),
+        }
+
+
+def _split(split: Split) -> dict[str, Any]:
+    return {
+        "parameter": split.name,
+        "with_contact": split.with_contact.tolist(),
+        "without_contact": split.without.tolist(),
+        "separation": _number(split.separation),
+        "p_value": _number(split.p_value),
+        "two_cluster_p_value": split.two_clusters,
+        "split": split.split,
+    }
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN: a test that could not be made is null."""
+    return None if np.isnan(value) else value
+
+
+def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, ParameterSpace]:
+    """Read a `bounds.json` or `identified.json` as a fitted point.
+
+    Args:
+      path: the file.
+      robot: the robot it should be of.
+
+    Returns:
+      The torque law and the robot's space for it with the fitted values as the nominal ones.
+
+    Raises:
+      InputError: the file is not a bounds file, or not of this robot.
+    """
+    document = read_json(path)
+    try:
+        if document["schema"] != SCHEMA:
+            raise InputError(f"{path}: schema {document['schema']!r}; this pup reads {SCHEMA}")
+        kind = document["actuator"]["kind"]
+        values = {p["name"]: float(p["nominal"]) for p in document["parameters"]}
+        weights: Sequence[float] = document["actuator"]["weights"]
+        space = robot_space(robot, kind)
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a bounds file ({type(error).__name__}: {error})") from error
+    if document.get("robot") != robot.name:
+        raise InputError(f"{path}: bounds of robot {document.get('robot')!r}, not {robot.name!r}")
+    unknown = sorted(set(values) - set(space.names))
+    if unknown:
+        raise InputError(f"{path}: parameter {unknown[0]!r} is not one of robot {robot.name!r}")
+    if kind == "nn_pd" and len(weights) != len(NETWORK_NAMES):
+        raise InputError(f"{path}: {len(weights)} network weights, {len(NETWORK_NAMES)} expected")
+    values |= {n: float(w) for n, w in zip(NETWORK_NAMES, weights, strict=False)}
+    if not np.isfinite(list(values.values())).all():
+        raise InputError(f"{path}: a parameter is not a finite number")
+    return kind, space.at(values)

@@ -1,0 +1,57 @@
+"""What the recordings say about each parameter around a fitted point."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.sysid.gauss_newton import Confidence, LeastSquares, confidence, least_squares
+from pup.sysid.problem import Problem
+
+Array = NDArray[np.float64]
+
+UNIFORM = 12.0
+"""Information of a uniform prior on the unit cube: one over its variance."""
+
+
+def observable(problem: Problem, unit: Array) -> tuple[str, ...]:
+    """The free parameters whose change changes the loss at all.
+
+    A suspended robot has no ground friction: such a parameter would drift freely in a fit and
+    come out as a precise number that means nothing.
+
+    Args:
+      problem: what is fitted.
+      unit: a point on the unit cube, shape (n_free,).
+    """
+    probes = np.tile(unit, (len(unit), 1))
+    np.fill_diagonal(probes, np.where(unit > 0.5, unit - 0.3, unit + 0.3))
+    losses = problem.losses(np.vstack([unit, probes]))
+    return tuple(n for n, loss in zip(problem.free, losses[1:], strict=True) if loss != losses[0])
+
+
+def confidence_at(problem: Problem, unit: Array) -> Confidence:
+    """90 % intervals and correlations at a fitted point, by the curvature of the squared error.
+
+    Residuals of a replay are far from independent, so the information is deflated by the
+    (1 + r)/(1 - r) of their lag-one autocorrelation r.
+
+    Args:
+      problem: what was fitted.
+      unit: the fitted point on the unit cube, shape (n_free,).
+    """
+    fit = least_squares(problem.residuals, unit, iterations=0)
+    position, _ = problem.loss.errors(problem.replay(unit[None]))
+    r = _lag_one(position[0], problem)
+    prior = UNIFORM * np.eye(len(unit))
+    information = (np.linalg.inv(fit.covariance) - prior) * (1 - r) / (1 + r)
+    covariance = np.asarray(np.linalg.inv(information + prior), dtype=np.float64)
+    return confidence(
+        problem.free_space,
+        LeastSquares(fit.best, fit.cost, fit.converged, fit.replays, covariance, fit.noise),
+    )
+
+
+def _lag_one(error: Array, problem: Problem) -> float:
+    """Lag-one autocorrelation of the joints' errors within recordings, 0 to 0.99."""
+    products = [(error[p][1:] * error[p][:-1]).sum() for p in problem.loss.ticks]
+    squares = [(error[p] ** 2).sum() for p in problem.loss.ticks]
+    return float(np.clip(sum(products) / max(sum(squares), 1e-300), 0.0, 0.99))

@@ -1,0 +1,214 @@
+"""What the report of pre-sysID says in words."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.parameters import ParameterSpace
+from pup.recording import Recording
+from pup.sysid.bounds import SPLIT_LEVEL
+from pup.sysid.result import Bounds
+
+Array = NDArray[np.float64]
+
+STRONG = 0.9
+"""Estimates correlated more than this are named as one quantity seen twice."""
+_PLACES = {"suspended": "suspended", "ground": "on the ground", "bench": "on a bench"}
+
+
+def listed(names: Sequence[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    if len(names) < 2:
+        return "".join(names)
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def counted(count: int, noun: str) -> str:
+    """`1 fit`, `2 fits`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def number(value: float) -> str:
+    """Four significant digits."""
+    return f"{value:.4g}"
+
+
+def thousandths(value: float) -> str:
+    """An error in thousandths, to a tenth or, where that says nothing, two digits."""
+    small = 1000 * value
+    return f"{small:.1f}" if small >= 1 else f"{small:.2g}"
+
+
+def p_value(value: float) -> str:
+    """A p-value, or that there is none."""
+    if np.isnan(value):
+        return "not tested"
+    return f"{value:.4f}"
+
+
+def recordings_words(recordings: Sequence[Recording]) -> str:
+    """How many recordings there are, and how many of each support."""
+    supports = Counter(r.support for r in recordings)
+    parts = [f"{n} {_PLACES[s]}" for s, n in sorted(supports.items(), reverse=True)]
+    return f"{counted(len(recordings), 'recording')} ({', '.join(parts)})"
+
+
+def unidentified(bounds: Bounds) -> list[str]:
+    """Names of the parameters that the recordings do not determine."""
+    return [n for n, known in zip(bounds.space.names, bounds.identified, strict=True) if not known]
+
+
+def splitting(bounds: Bounds) -> list[str]:
+    """Names of the parameters that split between subsets with and without contact."""
+    return [split.name for split in bounds.splits if split.split]
+
+
+def tested(bounds: Bounds) -> bool:
+    """Whether the test for a split could be made."""
+    return any(not np.isnan(split.p_value) for split in bounds.splits)
+
+
+def why_untested(bounds: Bounds, recordings: Sequence[Recording]) -> str:
+    """Why there is no test for a split."""
+    contact = [s.contact for s in bounds.subsets]
+    if not contact:
+        return "no fits to subsets of the recordings were made"
+    if not any(r.support == "ground" for r in recordings):
+        return "no recording is on the ground"
+    if all(r.support == "ground" for r in recordings):
+        return "every recording is on the ground"
+    few = min((contact.count(True), "with"), (contact.count(False), "without"))
+    if few[0] >= 2:
+        return "the subset fits were not compared"
+    return (
+        f"of the {len(contact)} subset fits {few[0] or 'none'} is {few[1]} ground contact, "
+        "and two on each side are needed"
+    )
+
+
+def split_words(bounds: Bounds, recordings: Sequence[Recording]) -> str:
+    """What came of the test for a split, in one sentence."""
+    if not tested(bounds):
+        return f"Could not be tested because {why_untested(bounds, recordings)}."
+    found = [
+        f"{split.name} (p = {p_value(split.p_value)})" for split in bounds.splits if split.split
+    ]
+    if not found:
+        return "No split found between subset fits with and without ground contact."
+    takes = "takes" if len(found) == 1 else "take"
+    return f"{listed(found)} {takes} other values with ground contact than without."
+
+
+def split_meaning(bounds: Bounds) -> list[str]:
+    """What the result of the test means, a paragraph each."""
+    found, vague = splitting(bounds), unidentified(bounds)
+    paragraphs = []
+    if found:
+        plural = len(found) > 1
+        paragraphs.append(
+            f"No single value of {listed(found)} explains both kinds of recordings: the model "
+            "lacks something that acts differently under contact. In the paper the torque limit "
+            "was bipolar in this way. The bounds cover both values, so a policy trained on them "
+            "copes with either, but the missing physics is still missing; pup diagnose looks "
+            "for it."
+        )
+        doubtful = [name for name in found if name in vague]
+        if doubtful:
+            paragraphs.append(
+                f"Caution: all the recordings together do not identify {listed(doubtful)}, so "
+                f"{'these splits' if plural else 'this split'} may show which recordings see the "
+                "parameter at all rather than two values of it."
+            )
+    elif tested(bounds):
+        paragraphs.append(
+            "One value of each parameter serves both kinds of recordings as far as these fits "
+            "can tell. With few subsets on either side only large differences would show."
+        )
+    clusters = two_clusters(bounds)
+    other = [name for name in clusters if name not in found]
+    if other:
+        paragraphs.append(
+            f"Without regard to contact, the values of {listed(other)} fall into two clusters: "
+            "something other than contact separates the subsets, such as single recordings."
+        )
+    return paragraphs
+
+
+def two_clusters(bounds: Bounds) -> list[str]:
+    """Parameters whose values fall into two clusters, corrected for the number looked at."""
+    level = SPLIT_LEVEL / max(1, len(bounds.splits))
+    return [split.name for split in bounds.splits if split.two_clusters < level]
+
+
+def strong_pairs(bounds: Bounds) -> list[str]:
+    """Pairs of parameters that the recordings hardly tell apart, strongest first."""
+    names, matrix = bounds.space.names, bounds.correlation
+    rows, columns = np.triu_indices(len(names), k=1)
+    pairs = sorted(zip(rows, columns, strict=True), key=lambda at: -abs(matrix[at]))
+    return [
+        f"{names[i]} and {names[j]} (r = {matrix[i, j]:+.2f}): "
+        + (
+            "raising both together changes the motion little"
+            if matrix[i, j] > 0
+            else "raising one and lowering the other changes the motion little"
+        )
+        for i, j in pairs
+        if abs(matrix[i, j]) > STRONG
+    ]
+
+
+def at_edge(bounds: Bounds) -> list[bool]:
+    """Whether each nominal value stands at an end of its search range, to 1 % of it."""
+    unit = bounds.space.normalise(bounds.nominal)
+    return [bool(value < 0.01 or value > 0.99) for value in unit]
+
+
+def flattened(value: Any, name: str = "") -> list[tuple[str, str]]:
+    """A JSON value as rows of name and text; nested names are joined by dots."""
+    if isinstance(value, dict):
+        items = [(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
+        return [row for key, inner in items for row in flattened(inner, key)]
+    if isinstance(value, list | tuple):
+        if any(isinstance(inner, dict | list | tuple) for inner in value):
+            return [row for i, inner in enumerate(value) for row in flattened(inner, f"{name}.{i}")]
+        return [(name, ", ".join(map(_plain, value)))]
+    return [(name, _plain(value))]
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return str(value)
+
+
+def with_unit(name: str, space: ParameterSpace) -> str:
+    """A parameter's name, with its unit where it has one."""
+    unit = space.units[space.names.index(name)]
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
+def spread(values: Array) -> str:
+    """Mean and standard deviation."""
+    return f"{values.mean():.3g} ± {values.std():.2g}" if len(values) else "none"
+
+
+def error(value: float, diverged: bool) -> str:
+    """An RMSE in thousandths, and whether the simulation broke down."""
+    return thousandths(value) + (" (broke down)" if diverged else "")
+
+
+def extremes(joints: Sequence[str], errors: Array) -> str:
+    """Smallest and largest error with their joints."""
+    low, high = int(np.argmin(errors)), int(np.argmax(errors))
+    least, most = thousandths(errors[low]), thousandths(errors[high])
+    return f"from {least} ({joints[low]}) to {most} ({joints[high]})"
+
+
+def setup(recording: Recording) -> str:
+    """The knobs set in a recording."""
+    return ", ".join(f"{knob} {value:g}" for knob, value in recording.setup.items())

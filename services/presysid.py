@@ -1,0 +1,296 @@
+"""The pre-sysID job: recordings in, `bounds.json` and `report.html` out (paper, section III)."""
+
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.physics.parameters import NETWORK_NAMES, robot_space
+from pup.recording import Recording
+from pup.robot import Actuator, RobotDescription
+from pup.sysid.bounds import contact_splits, draw_subsets, expanded_range
+from pup.sysid.fit import FitResult, FitSettings
+from pup.sysid.problem import Problem
+from pup.sysid.report import write_report
+from pup.sysid.result import Bounds, SubsetFit
+from pup.sysid.uncertainty import confidence_at, observable
+from workers.fits import Fit, Runner, Status
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, Sequence[Status]], None]
+
+SUBSET_SIGMA = 0.05
+"""First step of a subset's fit around the nominal point, as the authors' code has it."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How much work pre-sysID puts in.
+
+    Attributes:
+      actuator: torque law of the bounds.
+      generations: of each nominal fit.
+      population: candidates per generation.
+      subsets: random subsets of Algorithm 1.
+      subset_generations: of each subset's fit.
+      fraction: share of the recordings in a subset.
+      folds: leave-recordings-out fits that measure the held-out error; 0 for none.
+      compare: also fit the PD servo, for the paper's comparison.
+      seed: of everything random.
+    """
+
+    actuator: Actuator = "nn_pd"
+    generations: int = 500
+    population: int = 16
+    subsets: int = 10
+    subset_generations: int = 100
+    fraction: float = 0.1
+    folds: int = 0
+    compare: bool = True
+    seed: int = 0
+
+
+def identify(
+    robot: RobotDescription,
+    recordings: Sequence[Recording],
+    options: Options,
+    out: Path,
+    runner: Runner,
+    progress: Progress,
+    threads: int,
+) -> Bounds:
+    """Run pre-sysID and write its files.
+
+    Args:
+      robot: the robot.
+      recordings: of that robot.
+      options: the budget.
+      out: folder for `bounds.json`, `report.html` and `checkpoints/`.
+      runner: where the fits run.
+      progress: told the stage and how far its fits are.
+      threads: cores for the replays made in this process.
+
+    Raises:
+      InputError: there is nothing to fit, or a checkpoint is of another fit.
+    """
+    job = _Job(robot, tuple(recordings), options, out, runner, progress, threads)
+    return job.run()
+
+
+class _Job:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        recordings: tuple[Recording, ...],
+        options: Options,
+        out: Path,
+        runner: Runner,
+        progress: Progress,
+        threads: int,
+    ) -> None:
+        if options.folds > len(recordings):
+            raise InputError(f"{options.folds} folds for {len(recordings)} recordings")
+        self.robot, self.recordings, self.options = robot, recordings, options
+        self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
+        compared: tuple[Actuator, ...] = ("nn_pd", "pd") if options.compare else ()
+        self.actuators = tuple(
+            a
+            for a in dict.fromkeys((options.actuator, *compared))
+            if any(a in p.actuators for p in robot.parameters)
+        )
+
+    def run(self) -> Bounds:
+        begin = time.time()
+        full = {a: self._problem(a) for a in self.actuators}
+        fitted = self._nominal(full)
+        main = full[self.options.actuator]
+        best = main.values(fitted["nominal", self.options.actuator].best[None])[0]
+        bounded = replace(
+            main,
+            space=main.space.at(dict(zip(main.space.names, best, strict=True))),
+            free=tuple(n for n in main.space.names if n not in NETWORK_NAMES),
+        )
+        subsets, values = self._subsets(bounded, main.free)
+        bounds = self._bounds(bounded, fitted, full, subsets, values, begin)
+        bounds.write(self.out / "bounds.json")
+        replays = {a: p.replay(fitted["nominal", a].best[None]) for a, p in full.items()}
+        labels = {"nn_pd": "NN-PD", "pd": "PD"}
+        write_report(
+            self.out / "report.html",
+            bounds,
+            self.robot,
+            self.recordings,
+            {labels[a]: t for a, t in replays.items()},
+            main.loss,
+        )
+        return bounds
+
+    def _problem(self, actuator: Actuator) -> Problem:
+        """All recordings, with the parameters free that they can see."""
+        space = robot_space(self.robot, actuator)
+        problem = Problem(self.robot, self.recordings, actuator, space, space.names, self.threads)
+        return replace(problem, free=observable(problem, space.normalise(space.nominal)))
+
+    def _nominal(self, full: dict[Actuator, Problem]) -> dict[tuple[str, Actuator], FitResult]:
+        """The nominal fit and the folds' fits of each torque law."""
+        fits: dict[tuple[str, Actuator], Fit] = {}
+        for actuator, problem in full.items():
+            fits["nominal", actuator] = self._from_scratch(f"nominal_{actuator}", problem)
+            for k, kept in enumerate(self._folds()):
+                name = f"fold{k}_{actuator}"
+                fits[f"fold{k}", actuator] = self._from_scratch(name, problem.of(kept))
+        return dict(zip(fits, self._fit("nominal fits", list(fits.values())), strict=True))
+
+    def _from_scratch(self, name: str, problem: Problem) -> Fit:
+        o = self.options
+        start = problem.free_space.normalise(problem.free_space.nominal)
+        return Fit(
+            name,
+            problem,
+            FitSettings(start, 0.25, o.population, o.generations, o.seed),
+        )
+
+    def _folds(self) -> list[tuple[int, ...]]:
+        """Recordings kept in each fold; those left out are spread over the motion types."""
+        order = sorted(
+            range(len(self.recordings)),
+            key=lambda i: (self.recordings[i].motion, self.recordings[i].id),
+        )
+        folds = self.options.folds
+        return [
+            tuple(sorted(i for at, i in enumerate(order) if at % folds != k)) for k in range(folds)
+        ]
+
+    def _subsets(
+        self, bounded: Problem, seen: tuple[str, ...]
+    ) -> tuple[tuple[SubsetFit, ...], Array]:
+        """Algorithm 1's fits, each over the bounded parameters that the recordings can see."""
+        o = self.options
+        drawn = draw_subsets(len(self.recordings), o.subsets, o.fraction, o.seed)
+        free = tuple(n for n in bounded.free if n in seen)
+        fits = []
+        for i, subset in enumerate(drawn):
+            problem = replace(bounded.of(subset), free=free)
+            at = problem.free_space.normalise(problem.free_space.nominal)
+            settings = FitSettings(
+                at, SUBSET_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
+            )
+            fits.append(Fit(f"subset{i}", problem, settings))
+        results = self._fit("subset fits", fits)
+        names = [bounded.space.names.index(n) for n in bounded.free]
+        values = np.array(
+            [f.problem.values(r.best[None])[0, names] for f, r in zip(fits, results, strict=True)]
+        )
+        made = tuple(
+            SubsetFit(
+                tuple(r.id for r in fit.problem.recordings),
+                any(r.support == "ground" for r in fit.problem.recordings),
+                float(fit.problem.losses(result.best[None])[0]),
+                row,
+            )
+            for fit, result, row in zip(fits, results, values, strict=True)
+        )
+        return made, values
+
+    def _fit(self, stage: str, fits: list[Fit]) -> list[FitResult]:
+        checkpoints = self.out / "checkpoints"
+        checkpoints.mkdir(parents=True, exist_ok=True)
+        return self.runner.run(fits, checkpoints, lambda s: self.progress(stage, s))
+
+    def _bounds(
+        self,
+        bounded: Problem,
+        fitted: dict[tuple[str, Actuator], FitResult],
+        full: dict[Actuator, Problem],
+        subsets: tuple[SubsetFit, ...],
+        values: Array,
+        begin: float,
+    ) -> Bounds:
+        space = bounded.free_space
+        at = space.normalise(space.nominal)
+        known = confidence_at(bounded, at)
+        lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
+        # A subset's fit is pulled to the nominal point: where the data say nothing its range is
+        # narrow for that reason alone, and the interval takes its place.
+        lower = np.where(known.identified, lower, np.minimum(lower, known.lower))
+        upper = np.where(known.identified, upper, np.maximum(upper, known.upper))
+        actuator = self.options.actuator
+        main, nominal = full[actuator], fitted["nominal", actuator]
+        weights = [bounded.space.nominal[bounded.space.names.index(n)] for n in NETWORK_NAMES]
+        return Bounds(
+            robot=self.robot.name,
+            actuator=actuator,
+            space=space,
+            nominal=space.nominal,
+            lower=lower,
+            upper=upper,
+            ci90=np.stack([known.lower, known.upper], axis=1),
+            identified=known.identified,
+            correlation=known.correlation,
+            weights=np.array(weights if actuator == "nn_pd" else []),
+            train=_measured(main, nominal),
+            held_out=self._held_out(full, fitted),
+            subsets=subsets,
+            splits=tuple(contact_splits(values, space, [s.contact for s in subsets])),
+            histories={a: fitted["nominal", a].history for a in full},
+            omitted=tuple(main.loss.omitted()),
+            provenance=self._provenance(time.time() - begin),
+        )
+
+    def _held_out(
+        self,
+        full: dict[Actuator, Problem],
+        fitted: dict[tuple[str, Actuator], FitResult],
+    ) -> dict[str, float] | None:
+        """Pooled loss and root mean square error of the recordings that each fold left out."""
+        if not self.options.folds:
+            return None
+        measures: dict[str, float] = {}
+        everything = set(range(len(self.recordings)))
+        for actuator, problem in full.items():
+            errors, losses = [], []
+            for k, kept in enumerate(self._folds()):
+                left = problem.of(sorted(everything - set(kept)))
+                best = fitted[f"fold{k}", actuator].best[None]
+                errors.append(left.loss.rmse(left.replay(best))[0])
+                losses.append(left.losses(best)[0])
+            suffix = "" if actuator == self.options.actuator else f"_{actuator}"
+            measures["loss" + suffix] = float(np.mean(losses))
+            measures["rmse" + suffix] = _pooled(np.concatenate(errors))
+        return measures | {"folds": self.options.folds}
+
+    def _provenance(self, seconds: float) -> dict[str, Any]:
+        packages = ("pup", "mujoco", "nevergrad", "numpy")
+        return {
+            "options": asdict(self.options),
+            "robot_digest": self.robot.digest,
+            "recordings": {r.id: r.digest for r in self.recordings},
+            "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
+            "seconds": round(seconds, 1),
+        }
+
+
+def _measured(problem: Problem, fit: FitResult) -> dict[str, float]:
+    """Loss and RMSE (rad) over all recordings, at the robot's nominal values and after the fit."""
+    before = problem.free_space.normalise(problem.free_space.nominal)
+    replayed = problem.replay(np.stack([before, fit.best]))
+    losses = problem.loss.total(problem.loss.terms(replayed))
+    errors = [_pooled(e) for e in problem.loss.rmse(replayed)]
+    return {
+        "loss": float(losses[1]),
+        "rmse": errors[1],
+        "loss_before": float(losses[0]),
+        "rmse_before": errors[0],
+    }
+
+
+def _pooled(errors: Array) -> float:
+    """Root mean square over recordings and joints of per-joint errors, each with equal weight."""
+    return float(np.sqrt(np.nanmean(errors**2)))

@@ -1,0 +1,98 @@
+"""Progress on standard error: a live table on a terminal, plain lines when piped."""
+
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from workers.fits import Status
+
+PLAIN_SECONDS = 10.0
+
+
+class Reporter(Protocol):
+    """Told how far a stage is."""
+
+    def __call__(self, stage: str, statuses: Sequence[Status]) -> None:
+        """Show the fits of a stage."""
+        ...
+
+
+@contextmanager
+def reporter() -> Iterator[Reporter]:
+    """A reporter that fits standard error."""
+    if not sys.stderr.isatty():
+        yield _Plain()
+        return
+    with Live(console=Console(stderr=True), refresh_per_second=4, transient=True) as live:
+        yield _Table(live)
+
+
+class _Clock:
+    """Time spent and left in a stage, from the share of generations done since it began."""
+
+    def __init__(self) -> None:
+        self.stage, self.begin, self.first = "", 0.0, 0.0
+
+    def left(self, stage: str, share: float) -> str:
+        now = time.monotonic()
+        if stage != self.stage:
+            self.stage, self.begin, self.first = stage, now, share
+        if share <= self.first:
+            return "?"
+        return _duration((now - self.begin) * (1 - share) / (share - self.first))
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds:02d}"
+
+
+def _share(statuses: Sequence[Status]) -> float:
+    total = sum(s.generations for s in statuses)
+    return sum(s.generation for s in statuses) / total if total else 1.0
+
+
+def _loss(status: Status) -> str:
+    return f"{status.loss:.4f}" if math.isfinite(status.loss) else "-"
+
+
+class _Plain:
+    def __init__(self) -> None:
+        self.clock, self.last = _Clock(), -math.inf
+
+    def __call__(self, stage: str, statuses: Sequence[Status]) -> None:
+        share = _share(statuses)
+        left = self.clock.left(stage, share)
+        now = time.monotonic()
+        if now - self.last < PLAIN_SECONDS and share < 1:
+            return
+        self.last = now
+        done = sum(s.generation >= s.generations for s in statuses)
+        losses = " ".join(f"{s.name}={_loss(s)}" for s in statuses if s.generation)
+        print(
+            f"{stage}: {share:.0%}, {done}/{len(statuses)} fits done, {left} left  {losses}",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+class _Table:
+    def __init__(self, live: Live) -> None:
+        self.live, self.clock = live, _Clock()
+
+    def __call__(self, stage: str, statuses: Sequence[Status]) -> None:
+        share = _share(statuses)
+        left = self.clock.left(stage, share)
+        table = Table(title=f"{stage}: {share:.0%}, {left} left", title_justify="left")
+        for column in ("fit", "generation", "loss"):
+            table.add_column(column, justify="left" if column == "fit" else "right")
+        for s in statuses:
+            table.add_row(s.name, f"{s.generation}/{s.generations}", _loss(s))
+        self.live.update(table)

@@ -1,0 +1,323 @@
+"""Importers: what they make of each format, and of the real logs."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from foreign_logs import (
+    ARM,
+    CSV,
+    ROWS,
+    bam_log,
+    darwin_log,
+    npz_arrays,
+    one,
+    write_emps,
+    write_json_mcap,
+    write_npz,
+    write_ros,
+    write_sage,
+)
+from mcap.writer import CompressionType
+
+from pup.errors import InputError
+from pup.importers import ImportOptions, import_recordings
+from pup.importers.common import join
+from pup.importers.darwin_hardware import JOINTS
+from pup.recording import load_recordings
+from pup.robot import RobotDescription
+
+
+def test_darwin_commands_lag_their_rows_by_the_row_read_before_the_loop(tmp_path: Path) -> None:
+    """Row 0 is read while the first keyframe is held; row i follows the command of tick i - 1."""
+    path = tmp_path / "0.05_0.1_0.json"
+    path.write_text(json.dumps(darwin_log()))
+    recording = one("darwin-hardware", path)
+    assert recording.joints == JOINTS
+    assert recording.target[:, 0].tolist() == [0.0, 0.1, 0.1, 0.1, 0.0, 0.0]
+    np.testing.assert_allclose(recording.time, np.arange(6) * 0.05)
+    assert (recording.id, recording.motion, recording.support) == (
+        "step_0.1_0",
+        "step",
+        "suspended",
+    )
+    assert "velocity/l_el" not in recording.extras  # zero throughout: not measured
+    assert set(recording.extras) == {"imu/gyro_y"}
+    np.testing.assert_allclose(recording.extras["imu/gyro_y"], -6.4)
+
+
+def test_darwin_standups_stand_on_the_ground(tmp_path: Path) -> None:
+    path = tmp_path / "0.05_2.0_standup.json"
+    path.write_text(json.dumps(darwin_log(fix_root=False, vel=[[0.5] * 20] * 6)))
+    recording = one("darwin-hardware", path)
+    assert (recording.id, recording.motion, recording.support) == (
+        "standup_2.0",
+        "standup",
+        "ground",
+    )
+    assert (recording.extras["velocity/l_el"] == 0.5).all()
+
+
+def test_bam_header_becomes_the_setup(tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(bam_log()))
+    recording = one("bam", path)
+    assert recording.setup == {"mass": 0.3, "length": 0.1, "kp": 16.0, "vin": 6.0}
+    assert (recording.robot, recording.motion, recording.support) == (
+        "servo_bench",
+        "sin_sin",
+        "bench",
+    )
+    np.testing.assert_allclose(recording.extras["voltage"], 5.7)
+    assert recording.extras["torque_enabled"].tolist() == [1, 1, 1, 0, 0]
+    recording.validate(RobotDescription.load("servo_bench"))
+
+
+def test_bam_voltage_may_be_in_volts_already(tmp_path: Path) -> None:
+    log = bam_log()
+    for entry in log["entries"]:
+        entry["input_volts"] = 6.1
+    (tmp_path / "run.json").write_text(json.dumps(log))
+    np.testing.assert_allclose(one("bam", tmp_path / "run.json").extras["voltage"], 6.1)
+
+
+def test_bam_repeated_timestamps_go_with_a_note_and_backward_ones_are_refused(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.json"
+    log = bam_log()
+    log["entries"][3]["timestamp"] = log["entries"][2]["timestamp"]
+    path.write_text(json.dumps(log))
+    recording = one("bam", path)
+    assert len(recording.time) == 4
+    assert "1 rows that repeat a timestamp left out" in recording.notes
+    log["entries"][3]["timestamp"] = 0.001
+    path.write_text(json.dumps(log))
+    with pytest.raises(InputError, match="'time', row 3"):
+        one("bam", path)
+
+
+def test_emps_is_a_position_loop_with_its_output_as_load(tmp_path: Path) -> None:
+    recording = one("emps", write_emps(tmp_path / "DATA_EMPS.mat"))
+    assert (recording.id, recording.robot, recording.joints) == ("data_emps", "emps", ("axis",))
+    np.testing.assert_allclose(recording.target[:, 0] - recording.position[:, 0], 0.001)
+    np.testing.assert_allclose(recording.extras["load/axis"], 0.5)
+
+
+def test_sage_folders_keep_joint_names_and_note_what_is_left_out(tmp_path: Path) -> None:
+    names = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+    for motion in ("chirp_sweep", "hold_under_gravity"):
+        write_sage(tmp_path / "logs" / motion, names)
+    chirp, hold = import_recordings("sage", [tmp_path / "logs"])
+    assert (chirp.motion, hold.motion) == ("chirp", "hold")
+    assert (chirp.robot, chirp.support, chirp.joints) == ("so101", "bench", names[:5])
+    np.testing.assert_allclose(chirp.time, np.arange(4) * 0.02)
+    assert "Torques" in chirp.notes and "Jaw" in chirp.notes
+
+
+def test_sage_readings_between_commands_get_rows_of_their_own(tmp_path: Path) -> None:
+    folder = write_sage(tmp_path / "walk", offset=5_000)
+    recording = one("sage", folder, ImportOptions(robot="biped", support="ground"))
+    assert (recording.motion, recording.joints) == ("walk", ("Hip", "Knee"))
+    np.testing.assert_allclose(recording.time[:4], [0.0, 0.005, 0.02, 0.025])
+    np.testing.assert_allclose(recording.target[:4, 0], [0.0, 0.0, 0.1, 0.1])
+    np.testing.assert_allclose(recording.position[:4, 0], [np.nan, 0.0, np.nan, 0.1])
+
+
+@pytest.mark.parametrize("where", ["sensordata", "state"])
+def test_npz_is_read_as_mujoco_sysid_saves_it(tmp_path: Path, where: str) -> None:
+    recording = one("npz", write_npz(tmp_path / "t.npz", where), ARM)
+    assert recording.joints == ("hip",)
+    np.testing.assert_allclose(recording.time[:3], [0.0, 0.01, 0.02])
+    np.testing.assert_allclose(recording.target[:3, 0], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(recording.position[:4, 0], [np.nan, 0.0, np.nan, 0.5])
+    assert ("velocity/hip" in recording.extras) == (where == "state")
+
+
+def test_npz_is_read_as_mujoco_sysid_itself_saves_it(tmp_path: Path) -> None:
+    trajectory = pytest.importorskip(
+        "mujoco.sysid._src.trajectory", reason="mujoco.sysid needs its extra"
+    )
+    model = mujoco.MjModel.from_xml_string("""<mujoco>
+      <worldbody><body><joint name="hip"/><geom size="0.1"/></body></worldbody>
+      <actuator><position name="hip" joint="hip"/></actuator>
+      <sensor><jointpos name="hip_pos" joint="hip"/></sensor>
+    </mujoco>""")
+    wanted = npz_arrays()
+    series = trajectory.timeseries.TimeSeries
+    control = (wanted["control_times"], wanted["control_data"], model)
+    readings = (wanted["sensordata_times"], wanted["sensordata_data"], model)
+    trajectory.SystemTrajectory(
+        model,
+        series.from_control_names(*control),
+        series.from_names(*readings),
+        wanted["initial_state"],
+        None,
+    ).save_to_disk(tmp_path / "a.npz")
+    one_way = one("npz", tmp_path / "a.npz", ARM)
+    other = one("npz", write_npz(tmp_path / "b.npz"), ARM)
+    for (name, values), (same_name, same_values) in zip(
+        one_way.columns(), other.columns(), strict=True
+    ):
+        assert name == same_name
+        np.testing.assert_array_equal(values, same_values)
+
+
+def test_npz_without_names_needs_them(tmp_path: Path) -> None:
+    arrays = npz_arrays()
+    np.savez(tmp_path / "t.npz", **{k: v for k, v in arrays.items() if not k.endswith("_mapping")})
+    with pytest.raises(InputError, match="--joints"):
+        one("npz", tmp_path / "t.npz", ARM)
+    options = ImportOptions(robot="arm", motion="step", support="bench", joints=("hip",))
+    assert one("npz", tmp_path / "t.npz", options).joints == ("hip",)
+
+
+def test_csv_takes_metadata_from_options_or_its_first_line(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(CSV)
+    options = ImportOptions("arm", "step", "bench", setup={"mass": 2.0}, notes="by hand")
+    recording = one("csv", path, options)
+    assert (recording.id, recording.robot, recording.source) == ("log", "arm", "unknown")
+    assert (recording.setup, recording.notes) == ({"mass": 2.0}, "by hand")
+    np.testing.assert_allclose(recording.position[:, 0], [0.01, np.nan, 0.8])
+    np.testing.assert_allclose(recording.extras["voltage"], [12.0, 11.9, np.nan])
+    told = recording.metadata() | {"id": "named", "motion": "chirp"}
+    path.write_text(f"# pup.recording: {json.dumps(told)}\r\n" + CSV.replace("\n", "\r\n"))
+    assert one("csv", path).metadata() == told
+    assert one("csv", path, ImportOptions(motion="hold")).motion == "hold"
+
+
+def test_csv_names_what_nobody_told(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    with pytest.raises(InputError, match=r"log\.csv: the file does not tell the robot.*--robot"):
+        one("csv", tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_mcap_joins_joint_states_with_commands(
+    tmp_path: Path, stamped: bool, compression: CompressionType
+) -> None:
+    recording = one("mcap", write_ros(tmp_path / "log.mcap", stamped, compression), ARM)
+    assert recording.joints == ("b", "a")
+    np.testing.assert_allclose(recording.time, np.arange(10) * 0.01, atol=1e-9)
+    np.testing.assert_allclose(recording.target[:3, 1], [97.0, 97.0, 97.1])
+    np.testing.assert_allclose(recording.position[:4, 0], [np.nan, 98.0, np.nan, 98.1])
+    np.testing.assert_allclose(recording.extras["velocity/a"][:2], [np.nan, 1.0])
+    assert np.isnan(recording.extras["velocity/b"]).all()
+    assert "c" in recording.notes
+
+
+def test_mcap_topics_can_be_chosen(tmp_path: Path) -> None:
+    path = write_ros(tmp_path / "log.mcap")
+    chosen = ImportOptions("arm", "step", "bench", state_topic="/joint_states")
+    assert one("mcap", path, chosen).joints == ("b", "a")
+    for state, command in (("/joint_command", None), ("/absent", None), (None, "/joint_states")):
+        options = ImportOptions("arm", "step", "bench", state_topic=state, command_topic=command)
+        with pytest.raises(InputError, match="topic"):
+            one("mcap", path, options)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_mcap_json_messages_are_rows(tmp_path: Path, compression: CompressionType) -> None:
+    recording = one("mcap", write_json_mcap(tmp_path / "log.mcap", ROWS, compression), ARM)
+    np.testing.assert_allclose(recording.time, [0.0, 0.05, 0.12])
+    np.testing.assert_allclose(recording.position[:, 0], [0.01, np.nan, 0.8])
+    np.testing.assert_allclose(recording.extras["voltage"], [12.0, np.nan, np.nan])
+
+
+def test_readings_before_the_first_command_are_left_out_and_told() -> None:
+    columns, note = join(
+        np.array([1.0, 2.0]), np.array([0.5, 1.0, 1.5]), {"c": np.array([7.0, 8.0])},
+        {"s": np.array([1.0, 2.0, 3.0])},
+    )  # fmt: skip
+    assert columns["time"].tolist() == [0.0, 0.5, 1.0]
+    assert columns["c"].tolist() == [7.0, 7.0, 8.0]
+    np.testing.assert_allclose(columns["s"], [2.0, 3.0, np.nan])
+    assert note.startswith("1 readings")
+
+
+def test_a_robot_gives_its_name_and_must_fit(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    robot = RobotDescription.load("servo_bench")
+    options = ImportOptions(motion="step", support="bench")
+    with pytest.raises(InputError, match=r"log\.csv: .*unknown joints a "):
+        import_recordings("csv", [tmp_path / "log.csv"], robot, options)
+    (tmp_path / "log.csv").write_text(CSV.replace("/a", "/servo"))
+    (recording,) = import_recordings("csv", [tmp_path], robot, options)
+    assert recording.robot == "servo_bench"
+
+
+def test_refuses_unknown_formats_absent_paths_and_equal_ids(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="csv, darwin-hardware"):
+        import_recordings("pickle", [tmp_path])
+    with pytest.raises(InputError, match="no such file"):
+        import_recordings("csv", [tmp_path / "absent.csv"])
+    with pytest.raises(InputError, match=r"no \*\.csv"):
+        import_recordings("csv", [tmp_path])
+    with pytest.raises(InputError, match="no log given"):
+        import_recordings("csv", [])
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "log.csv").write_text(CSV)
+    with pytest.raises(InputError, match="id 'log' is also that of"):
+        import_recordings("csv", [tmp_path / "one", tmp_path / "two"], options=ARM)
+
+
+# The real logs
+
+
+@pytest.mark.parametrize(
+    ("format", "folder", "robot", "count"),
+    [
+        ("darwin-hardware", "darwin_op2_hardware", "darwin_op2", 19),
+        ("bam", "servo_sts3032", "servo_bench", 48),
+        ("emps", "emps", "emps", 1),
+        ("sage", "so101", None, 5),
+    ],
+)
+def test_the_real_logs_become_recordings_of_the_contract(
+    shared: Path,
+    check_contract: Callable[[Path], None],
+    tmp_path: Path,
+    format: str,
+    folder: str,
+    robot: str | None,
+    count: int,
+) -> None:
+    description = RobotDescription.load(robot) if robot else None
+    found = import_recordings(format, [shared / "recordings" / folder], description)
+    assert len(found) == count
+    for recording in found:
+        recording.write(tmp_path / f"{recording.id}.parquet")
+    check_contract(tmp_path)
+    assert [r.digest for r in load_recordings([tmp_path])] == [r.digest for r in found]
+
+
+def test_real_darwin_joints_move_after_their_command_and_not_before(shared: Path) -> None:
+    """The evidence for the importer's timing, from all 60 moves of the 15 step tests."""
+    found = import_recordings("darwin-hardware", [shared / "recordings" / "darwin_op2_hardware"])
+    steps = [recording for recording in found if recording.motion == "step"]
+    assert len(steps) == 15
+    for recording in steps:
+        sent = np.flatnonzero(np.abs(np.diff(recording.target, axis=0)).max(axis=1) > 0) + 1
+        assert sent.tolist() == [1, 6, 11, 16]
+        for row in sent:
+            step = recording.target[row] - recording.target[row - 1]
+            size = np.abs(step).sum()
+            before, after = np.diff(recording.position[row - 1 : row + 2], axis=0) @ np.sign(step)
+            assert before < 0.05 * size
+            assert after > 0.25 * size
+
+
+def test_real_emps_readings_and_commands_are_of_one_instant(shared: Path) -> None:
+    """The known controller, v = kp kv (target - q) - kv dq, gives the logged output."""
+    (recording,) = import_recordings("emps", [shared / "recordings" / "emps"])
+    q, target = recording.position[:, 0], recording.target[:, 0]
+    output = 10 * recording.extras["load/axis"]
+    speed = np.convolve(np.gradient(q, recording.time), np.ones(9) / 9, "same")
+    expected = 160.18 * 243.45 * (target - q) - 243.45 * speed
+    assert np.sqrt(np.mean((output - expected)[100:-100] ** 2)) < 0.2

@@ -1,0 +1,165 @@
+"""Recordings: what they keep, load and fit."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from recordings import COLUMNS, make, write_table
+
+from pup.errors import InputError
+from pup.recording import Recording, load_recordings
+from pup.robot import RobotDescription
+
+
+def same(one: Recording, other: Recording) -> bool:
+    mine, its = dict(one.columns()), dict(other.columns())
+    return (
+        one.metadata() == other.metadata()
+        and list(mine) == list(its)
+        and all(np.array_equal(mine[name], its[name], equal_nan=True) for name in mine)
+    )
+
+
+def test_reads_what_the_contract_describes(tmp_path: Path) -> None:
+    recording = Recording.read(write_table(tmp_path / "r.parquet", COLUMNS))
+    assert recording.joints == ("a", "b")
+    assert recording.target.shape == recording.position.shape == (4, 2)
+    assert recording.setup == {"mass": 0.5}
+    assert np.isnan(recording.position[1, 1]) and np.isnan(recording.target[3, 0])
+    assert set(recording.extras) == {"velocity/a", "voltage", "imu/gyro_y", "torque_enabled"}
+
+
+def test_missing_samples_are_null_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "r.parquet"
+    make(extras={"voltage": [12.0, np.nan, 11.0]}).write(path)
+    table = pq.read_table(path)
+    assert table.column("position/a").to_pylist() == [0.0, 0.1, None]
+    assert table.column("voltage").to_pylist() == [12.0, None, 11.0]
+
+
+def test_what_is_written_keeps_the_contract(
+    tmp_path: Path, check_contract: Callable[[Path], None]
+) -> None:
+    extras = {name: [1.0, np.nan, 0.0] for name in ("velocity/b", "imu/gyro_x", "torque_enabled")}
+    make(extras=extras, setup={"mass": 1}, repeat_of="r0").write(tmp_path / "r.parquet")
+    check_contract(tmp_path)
+
+
+def test_samples_cannot_be_changed_behind_its_back() -> None:
+    source = np.zeros((3, 2))
+    recording = make(target=source)
+    source[:] = 7.0
+    assert not recording.target.any()
+    with pytest.raises(ValueError, match="read-only"):
+        recording.target[0, 0] = 1.0
+
+
+def test_digest_follows_every_content_and_not_the_column_order() -> None:
+    extras = {"voltage": [1.0, 2.0, 3.0], "imu/yaw": [0.0, 0.0, 0.0]}
+    one = make(extras=extras)
+    assert one.digest == make(extras=dict(reversed(extras.items()))).digest
+    assert (
+        len({one.digest, make().digest, make(notes="x").digest, make(time=[0, 1, 2]).digest}) == 4
+    )
+
+
+NAMES = st.lists(
+    st.text(
+        st.characters(categories=("L", "N"), include_characters="_./-"), min_size=1, max_size=8
+    ),
+    min_size=1,
+    max_size=4,
+    unique=True,
+)
+VALUES = st.floats(-1e6, 1e6) | st.just(float("nan"))
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    joints = tuple(draw(NAMES))
+    gaps = draw(st.lists(st.floats(1e-4, 10.0), min_size=1, max_size=12))
+    rows = len(gaps) + 1
+
+    def values(*shape: int) -> np.ndarray:
+        drawn = draw(hnp.arrays(np.float64, shape, elements=VALUES))
+        drawn[0] = np.nan_to_num(drawn[0])  # every needed column has one sample
+        return drawn
+
+    extras = {}
+    for kind in draw(st.sets(st.sampled_from(("velocity", "current", "load", "temperature")))):
+        extras[f"{kind}/{joints[0]}"] = values(rows)
+    for name in draw(st.sets(st.sampled_from(("voltage", "imu/roll", "imu/accel_z")))):
+        extras[name] = values(rows)
+    return make(
+        id=draw(st.text(st.characters(categories=("L", "N")), min_size=1, max_size=20)),
+        joints=joints,
+        time=draw(st.floats(-1e3, 1e3)) + np.concatenate([[0.0], np.cumsum(gaps)]),
+        target=values(rows, len(joints)),
+        position=values(rows, len(joints)),
+        extras=extras,
+        setup=draw(st.dictionaries(st.text(max_size=5), st.floats(-1e9, 1e9), max_size=3)),
+        repeat_of=draw(st.none() | st.just("other")),
+        notes=draw(st.text(max_size=30)),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(recordings())
+def test_writing_and_reading_keeps_everything(tmp_path_factory: Any, recording: Recording) -> None:
+    path = tmp_path_factory.mktemp("round") / "r.parquet"
+    recording.write(path)
+    back = Recording.read(path)
+    assert same(back, recording)
+    assert back.digest == recording.digest
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> None:
+    path = tmp_path / "r.parquet"
+    make().write(path)
+
+    def fail(*_: Any) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("pup.files.os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        make(notes="new").write(path)
+    assert Recording.read(path).notes == ""
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_loads_files_and_folders_sorted_by_id(tmp_path: Path) -> None:
+    for name in ("b", "c", "a"):
+        make(id=name).write(tmp_path / "set" / f"{name}.parquet")
+    make(id="0").write(tmp_path / "z.parquet")
+    found = load_recordings([tmp_path / "set", tmp_path / "z.parquet"])
+    assert [recording.id for recording in found] == ["0", "a", "b", "c"]
+
+
+def test_refuses_sets_that_are_empty_or_name_an_id_twice(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no \*\.parquet"):
+        load_recordings([tmp_path])
+    with pytest.raises(InputError, match="no recording given"):
+        load_recordings([])
+    for name in ("x", "y"):
+        make(id="same").write(tmp_path / f"{name}.parquet")
+    with pytest.raises(InputError, match=r"y\.parquet: id 'same' is also that of .*x\.parquet"):
+        load_recordings([tmp_path])
+
+
+def test_validate_wants_exactly_the_robots_joints_and_knobs() -> None:
+    robot = RobotDescription.load("servo_bench")
+    fitting = make(
+        joints=("servo",), target=np.zeros((3, 1)), position=np.zeros((3, 1)), setup={"kp": 32}
+    )
+    fitting.validate(robot)
+    with pytest.raises(InputError, match="unknown joints a, b and joints servo not recorded"):
+        make().validate(robot)
+    with pytest.raises(InputError, match=r"recording 'r1': setup: 'colour' is no knob"):
+        dataclasses.replace(fitting, setup={"colour": 1.0}).validate(robot)

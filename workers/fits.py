@@ -1,0 +1,222 @@
+"""CMA-ES fits on Ray: an actor per fit, one pool of stateless evaluation tasks for all of them.
+
+An actor owns its fit's state and writes a checkpoint after every generation; killed, it is started
+again and resumes from it. Evaluations are tasks without state, so that a lost node costs a task.
+Neither the number of workers nor how a generation is cut into tasks changes any result.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import ray
+from numpy.typing import NDArray
+from ray.exceptions import RayError, RayTaskError
+
+from pup.sysid.fit import FitResult, FitSettings, run_fit
+from pup.sysid.problem import Problem
+
+Array = NDArray[np.float64]
+
+TASK_SECONDS = 0.05
+"""A task should last at least this long: Ray's own cost per task is half a millisecond."""
+POLL_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One fit of a list.
+
+    Attributes:
+      name: also the name of its checkpoint.
+      problem: what is evaluated.
+      settings: the search.
+    """
+
+    name: str
+    problem: Problem
+    settings: FitSettings
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a fit is.
+
+    Attributes:
+      name: of the fit.
+      generation: generations done.
+      generations: of how many.
+      loss: best objective so far.
+    """
+
+    name: str
+    generation: int
+    generations: int
+    loss: float
+
+
+Progress = Callable[[Sequence[Status]], None]
+
+
+class Runner(Protocol):
+    """Runs fits to their end."""
+
+    def run(self, fits: Sequence[Fit], checkpoints: Path, progress: Progress) -> list[FitResult]:
+        """Run the fits, resuming those that have a checkpoint in the folder."""
+        ...
+
+
+class LocalRunner:
+    """Runs fits one after the other in this process, without Ray."""
+
+    def run(self, fits: Sequence[Fit], checkpoints: Path, progress: Progress) -> list[FitResult]:
+        """See Runner."""
+        statuses = {f.name: Status(f.name, 0, f.settings.generations, np.inf) for f in fits}
+        results = []
+        for fit in fits:
+
+            def report(result: FitResult, fit: Fit = fit) -> None:
+                done = Status(fit.name, len(result.history), fit.settings.generations, result.loss)
+                statuses[fit.name] = done
+                progress(list(statuses.values()))
+
+            checkpoint = checkpoints / f"{fit.name}.npz"
+            problem = fit.problem
+            results.append(
+                run_fit(fit.settings, problem.losses, checkpoint, report, problem.digest)
+            )
+        return results
+
+
+class RayRunner:
+    """Runs fits at once on the Ray cluster this process is connected to.
+
+    Checkpoints must lie where every node can write.
+    """
+
+    def run(self, fits: Sequence[Fit], checkpoints: Path, progress: Progress) -> list[FitResult]:
+        """See Runner."""
+        shared = {f.problem.digest: f.problem for f in fits}
+        references = {d: ray.put(replace(p, threads=1)) for d, p in shared.items()}
+        waiting = list(enumerate(fits))[::-1]
+        running: dict[Any, tuple[int, Any]] = {}
+        results: dict[int, FitResult] = {}
+        statuses = [Status(f.name, 0, f.settings.generations, np.inf) for f in fits]
+        try:
+            while waiting or running:
+                while waiting and len(running) < max(4, 2 * _cores()):
+                    i, fit = waiting.pop()
+                    digest = fit.problem.digest
+                    path = str(checkpoints / f"{fit.name}.npz")
+                    actor = FitActor.remote()  # type: ignore[attr-defined]
+                    run = actor.run.remote([references[digest]], digest, fit.settings, path)
+                    running[run] = (i, actor)
+                for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
+                    i, _ = running.pop(reference)  # its actor ends with its last reference
+                    results[i] = _result(reference)
+                    statuses[i] = _status(fits[i], len(results[i].history), results[i].loss)
+                _poll(running.values(), fits, statuses)
+                progress(statuses)
+        finally:
+            for _, actor in running.values():
+                ray.kill(actor)
+        return [results[i] for i in range(len(fits))]
+
+
+def _result(reference: Any) -> FitResult:
+    """An actor's result; what went wrong in it is raised as it was there."""
+    try:
+        return ray.get(reference)
+    except RayTaskError as error:
+        raise error.cause from error
+
+
+def _poll(running: Iterable[tuple[int, Any]], fits: Sequence[Fit], statuses: list[Status]) -> None:
+    """Ask the actors how far they are, and tell them their share of the cores."""
+    live = list(running)
+    share = max(1, _cores() // max(1, len(live)))
+    asked = [(i, actor.status.remote(share)) for i, actor in live]
+    if asked:
+        answered, _ = ray.wait([a for _, a in asked], num_returns=len(asked), timeout=POLL_SECONDS)
+        for i, answer in asked:
+            # An actor that starts, restarts or has just ended does not answer.
+            with suppress(RayError):
+                if answer in answered:
+                    statuses[i] = _status(fits[i], *ray.get(answer))
+
+
+def _status(fit: Fit, generation: int, loss: float) -> Status:
+    return Status(fit.name, generation, fit.settings.generations, loss)
+
+
+def _cores() -> int:
+    return max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+@ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1, max_concurrency=2)
+class FitActor:
+    """Owns one fit; see the module."""
+
+    def __init__(self) -> None:
+        self.share = 1
+        self.cost = np.inf  # s per candidate, measured
+        self.state = (0, np.inf)
+        self.lock = threading.Lock()
+
+    def run(
+        self, problem: list[Any], digest: str, settings: FitSettings, checkpoint: str
+    ) -> FitResult:
+        """Run a fit to its end.
+
+        Args:
+          problem: the problem's reference, in a list so that Ray leaves it a reference.
+          digest: of the problem.
+          settings: the search.
+          checkpoint: path of its checkpoint.
+        """
+
+        def losses(unit: Array) -> Array:
+            return self._evaluate(problem, digest, unit)
+
+        return run_fit(settings, losses, Path(checkpoint), self._progress, digest)
+
+    def status(self, share: int) -> tuple[int, float]:
+        """Generations done and the best objective; takes the number of tasks to cut one into."""
+        with self.lock:
+            self.share = share
+            return self.state
+
+    def _progress(self, result: FitResult) -> None:
+        with self.lock:
+            self.state = (len(result.history), result.loss)
+
+    def _evaluate(self, problem: list[Any], digest: str, unit: Array) -> Array:
+        with self.lock:
+            longest = max(1, int(len(unit) * self.cost / TASK_SECONDS)) if self.cost < np.inf else 1
+            parts = min(self.share, longest, len(unit))
+        pieces = np.array_split(unit, parts)
+        answers = ray.get([evaluate.remote(problem, digest, p) for p in pieces])
+        self.cost = sum(seconds for _, seconds in answers) / len(unit)
+        return np.concatenate([losses for losses, _ in answers])
+
+
+@ray.remote(num_cpus=1, max_retries=-1)
+def evaluate(problem: list[Any], digest: str, unit: Array) -> tuple[Array, float]:
+    """Losses of some candidates and the seconds they took."""
+    begin = time.perf_counter()
+    if digest not in _PROBLEMS:
+        if len(_PROBLEMS) >= CACHED_PROBLEMS:
+            _PROBLEMS.clear()
+        _PROBLEMS[digest] = ray.get(problem[0])
+    losses = _PROBLEMS[digest].losses(unit)
+    return losses, time.perf_counter() - begin
+
+
+_PROBLEMS: dict[str, Problem] = {}
+"""Problems with their compiled models, kept by a worker process from task to task."""
+CACHED_PROBLEMS = 16
