@@ -7,9 +7,11 @@ A missing sample is null in the file and NaN in memory; a NaN in the file is ref
 import hashlib
 import io
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -141,10 +143,10 @@ class Recording:
         return digest.hexdigest()
 
     def validate(self, robot: RobotDescription) -> None:
-        """Check that the recording is of this robot: exactly its joints, and knobs it has.
+        """Check that the recording is of this robot: exactly its joints, knobs it has, its base.
 
         Raises:
-          InputError: a joint or knob does not fit.
+          InputError: a joint, a knob or the support does not fit.
         """
         unknown = [name for name in self.joints if name not in robot.joint_names]
         absent = [name for name in robot.joint_names if name not in self.joints]
@@ -154,6 +156,13 @@ class Recording:
             raise InputError(
                 f"recording {self.id!r} (of robot {self.robot!r}): {' and '.join(told)} for robot "
                 f"{robot.name!r}; a recording must cover exactly the robot's joints"
+            )
+        wrong = "bench" if robot.floating else "ground"
+        if self.support == wrong:
+            base, right = ("free", "suspended") if robot.floating else ("fixed", "bench")
+            raise InputError(
+                f"recording {self.id!r}: its support is {wrong!r}, but the base of robot "
+                f"{robot.name!r} is {base} in model.xml; should the support be {right!r}?"
             )
         try:
             robot.setup(self.setup)
@@ -224,14 +233,18 @@ def from_columns(metadata: object, columns: Mapping[str, Array]) -> Recording:
     )
 
 
-def load_recordings(paths: Sequence[Path]) -> tuple[Recording, ...]:
+def load_recordings(
+    paths: Sequence[Path], robot: RobotDescription | None = None
+) -> tuple[Recording, ...]:
     """Read recordings from files and folders, sorted by id.
 
     Args:
       paths: Parquet files, or folders that hold some.
+      robot: when given, every recording must be one that this robot can replay.
 
     Raises:
-      InputError: nothing found, an id stands twice, or a recording breaks a rule.
+      InputError: nothing found, an id stands twice, or a recording breaks a rule; the message names
+        the file.
     """
     files: list[Path] = []
     for path in map(Path, paths):
@@ -245,6 +258,11 @@ def load_recordings(paths: Sequence[Path]) -> tuple[Recording, ...]:
     recordings = []
     for file in files:
         recording = Recording.read(file)
+        if robot is not None:
+            try:
+                recording.validate(robot)
+            except InputError as error:
+                raise InputError(f"{file}: {error}") from error
         if recording.id in origin:
             raise InputError(
                 f"{file}: id {recording.id!r} is also that of {origin[recording.id]}; "
@@ -253,6 +271,26 @@ def load_recordings(paths: Sequence[Path]) -> tuple[Recording, ...]:
         origin[recording.id] = file
         recordings.append(recording)
     return tuple(sorted(recordings, key=lambda recording: recording.id))
+
+
+def write_recordings(recordings: Sequence[Recording], folder: Path) -> tuple[Path, ...]:
+    """Write recordings into a folder, named by their ids: all of them or, on an error, none.
+
+    Args:
+      recordings: each with an id of its own.
+      folder: made when absent.
+
+    Returns:
+      The files, in the order of the recordings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = tuple(folder / f"{recording.id}.parquet" for recording in recordings)
+    with TemporaryDirectory(dir=folder, prefix=".new-") as new:
+        for recording, file in zip(recordings, files, strict=True):
+            recording.write(Path(new) / file.name)
+        for file in files:
+            os.replace(Path(new) / file.name, file)
+    return files
 
 
 def _frozen(name: str, values: object) -> Array:

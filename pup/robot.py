@@ -144,6 +144,11 @@ class RobotDescription:
         return np.array([self.groups.index(joint.group) for joint in self.joints], dtype=np.intp)
 
     @property
+    def actuator(self) -> Actuator:
+        """The torque law to use when none is asked for: NN-PD where the robot has a network."""
+        return "pd" if self.network is None else "nn_pd"
+
+    @property
     def model_path(self) -> Path:
         """The MJCF file."""
         return self.folder / "model.xml"

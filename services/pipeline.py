@@ -16,7 +16,6 @@ from services.presysid import Options, Progress, identify
 from services.replay import replay
 from workers.fits import Runner
 
-DEFAULT_ROBOT = "darwin_op2"
 SHIPPED = "recordings"
 """Folder of a built-in robot with recordings of our own, from a concealed virtual robot."""
 
@@ -47,7 +46,7 @@ def run(
     progress: Progress,
     threads: int,
 ) -> dict[str, Any]:
-    """Run the job; stages whose inputs have not changed and whose files are there are kept.
+    """Run the job; stages whose inputs and files have not changed since are kept.
 
     Args:
       robot: the robot.
@@ -98,19 +97,25 @@ def _once(stage: Stage, out: Path) -> dict[str, Any]:
     done = read_json(journal) if journal.exists() else {"schema": 1, "stages": {}}
     if not isinstance(done, dict) or not isinstance(done.get("stages"), dict):
         raise InputError(f"{journal}: not the journal of a job; use another --out")
-    entry = done["stages"].get(stage.name, {})
-    there = all((out / file).exists() for file in stage.files)
-    if entry.get("inputs") == stage.inputs and there:
+    entry = done["stages"].get(stage.name)
+    known = {"inputs": stage.inputs, "files": _files(stage, out)}
+    if isinstance(entry, dict) and {k: entry.get(k) for k in known} == known:
         return dict(read_json(out / stage.files[0]))
     begin = time.time()
     shown = stage.work()
     done["stages"][stage.name] = {
         "inputs": stage.inputs,
         "seconds": round(time.time() - begin, 1),
-        "files": list(stage.files),
+        "files": _files(stage, out),
     }
     write_json(journal, done)
     return shown
+
+
+def _files(stage: Stage, out: Path) -> dict[str, str]:
+    """SHA-256 of those of a stage's files that are there."""
+    there = [file for file in stage.files if (out / file).is_file()]
+    return {file: hashlib.sha256((out / file).read_bytes()).hexdigest() for file in there}
 
 
 def default_recordings(robot: RobotDescription) -> tuple[Recording, ...]:
@@ -124,4 +129,4 @@ def default_recordings(robot: RobotDescription) -> tuple[Recording, ...]:
         raise InputError(
             f"robot {robot.name!r} comes without recordings; give some with --recordings DIR"
         )
-    return load_recordings([folder])
+    return load_recordings([folder], robot)

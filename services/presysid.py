@@ -1,5 +1,6 @@
 """The pre-sysID job: recordings in, `bounds.json` and `report.html` out (paper, section III)."""
 
+import hashlib
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -42,7 +43,9 @@ class Options:
       subset_generations: of each subset's fit.
       fraction: share of the recordings in a subset.
       folds: leave-recordings-out fits that measure the held-out error; 0 for none.
-      compare: also fit the PD servo, for the paper's comparison.
+      compare: also fit the other torque law, for the paper's comparison.
+      fixed_network: keep the robot's network weights instead of fitting them. Free weights can
+        trade places with rho and sigma, whose values then mean something only beside them.
       seed: of everything random.
     """
 
@@ -54,6 +57,7 @@ class Options:
     fraction: float = 0.1
     folds: int = 0
     compare: bool = True
+    fixed_network: bool = False
     seed: int = 0
 
 
@@ -95,16 +99,15 @@ class _Job:
         progress: Progress,
         threads: int,
     ) -> None:
-        if options.folds > len(recordings):
-            raise InputError(f"{options.folds} folds for {len(recordings)} recordings")
+        if options.folds == 1 or options.folds > len(recordings):
+            raise InputError(
+                f"{options.folds} folds for {len(recordings)} recordings; use 2 to their number, "
+                "for each fold leaves some out and keeps some, or 0 for none"
+            )
         self.robot, self.recordings, self.options = robot, recordings, options
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
-        compared: tuple[Actuator, ...] = ("nn_pd", "pd") if options.compare else ()
-        self.actuators = tuple(
-            a
-            for a in dict.fromkeys((options.actuator, *compared))
-            if any(a in p.actuators for p in robot.parameters)
-        )
+        compared: tuple[Actuator, ...] = (robot.actuator, "pd") if options.compare else ()
+        self.actuators = tuple(dict.fromkeys((options.actuator, *compared)))
 
     def run(self) -> Bounds:
         begin = time.time()
@@ -117,8 +120,8 @@ class _Job:
             space=main.space.at(dict(zip(main.space.names, best, strict=True))),
             free=tuple(n for n in main.space.names if n not in NETWORK_NAMES),
         )
-        subsets, values = self._subsets(bounded, main.free)
-        bounds = self._bounds(bounded, fitted, full, subsets, values, begin)
+        subsets = self._subsets(bounded)
+        bounds = self._bounds(bounded, fitted, full, subsets, begin)
         bounds.write(self.out / "bounds.json")
         replays = {a: p.replay(fitted["nominal", a].best[None]) for a, p in full.items()}
         labels = {"nn_pd": "NN-PD", "pd": "PD"}
@@ -135,8 +138,12 @@ class _Job:
     def _problem(self, actuator: Actuator) -> Problem:
         """All recordings, with the parameters free that they can see."""
         space = robot_space(self.robot, actuator)
-        problem = Problem(self.robot, self.recordings, actuator, space, space.names, self.threads)
-        return replace(problem, free=observable(problem, space.normalise(space.nominal)))
+        free = tuple(
+            n for n in space.names if not (self.options.fixed_network and n in NETWORK_NAMES)
+        )
+        problem = Problem(self.robot, self.recordings, actuator, space, free, self.threads)
+        start = problem.free_space.normalise(problem.free_space.nominal)
+        return replace(problem, free=observable(problem, start))
 
     def _nominal(self, full: dict[Actuator, Problem]) -> dict[tuple[str, Actuator], FitResult]:
         """The nominal fit and the folds' fits of each torque law."""
@@ -144,7 +151,7 @@ class _Job:
         for actuator, problem in full.items():
             fits["nominal", actuator] = self._from_scratch(f"nominal_{actuator}", problem)
             for k, kept in enumerate(self._folds()):
-                name = f"fold{k}_{actuator}"
+                name = f"fold{k}of{self.options.folds}_{actuator}"
                 fits[f"fold{k}", actuator] = self._from_scratch(name, problem.of(kept))
         return dict(zip(fits, self._fit("nominal fits", list(fits.values())), strict=True))
 
@@ -168,39 +175,30 @@ class _Job:
             tuple(sorted(i for at, i in enumerate(order) if at % folds != k)) for k in range(folds)
         ]
 
-    def _subsets(
-        self, bounded: Problem, seen: tuple[str, ...]
-    ) -> tuple[tuple[SubsetFit, ...], Array]:
-        """Algorithm 1's fits, each over the bounded parameters that the recordings can see."""
+    def _subsets(self, bounded: Problem) -> tuple[SubsetFit, ...]:
+        """Algorithm 1's fits, each over the bounded parameters that its recordings can see."""
         o = self.options
-        drawn = draw_subsets(len(self.recordings), o.subsets, o.fraction, o.seed)
-        free = tuple(n for n in bounded.free if n in seen)
+        nominal = bounded.free_space.normalise(bounded.free_space.nominal)
         fits = []
+        drawn = draw_subsets(len(self.recordings), o.subsets, o.fraction, o.seed)
         for i, subset in enumerate(drawn):
-            problem = replace(bounded.of(subset), free=free)
+            problem = bounded.of(subset)
+            problem = replace(problem, free=observable(problem, nominal))
             at = problem.free_space.normalise(problem.free_space.nominal)
             settings = FitSettings(
                 at, SUBSET_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
             )
             fits.append(Fit(f"subset{i}", problem, settings))
-        results = self._fit("subset fits", fits)
-        names = [bounded.space.names.index(n) for n in bounded.free]
-        values = np.array(
-            [f.problem.values(r.best[None])[0, names] for f, r in zip(fits, results, strict=True)]
+        # They start from the nominal fit: another one, after more generations, makes them others.
+        place = f"subsets-{_short(bounded.digest, o.fraction)}"
+        results = self._fit("subset fits", fits, place)
+        return tuple(
+            _subset_fit(fit.problem, result, bounded.free)
+            for fit, result in zip(fits, results, strict=True)
         )
-        made = tuple(
-            SubsetFit(
-                tuple(r.id for r in fit.problem.recordings),
-                any(r.support == "ground" for r in fit.problem.recordings),
-                float(fit.problem.losses(result.best[None])[0]),
-                row,
-            )
-            for fit, result, row in zip(fits, results, values, strict=True)
-        )
-        return made, values
 
-    def _fit(self, stage: str, fits: list[Fit]) -> list[FitResult]:
-        checkpoints = self.out / "checkpoints"
+    def _fit(self, stage: str, fits: list[Fit], place: str = "") -> list[FitResult]:
+        checkpoints = self.out / "checkpoints" / place
         checkpoints.mkdir(parents=True, exist_ok=True)
         return self.runner.run(fits, checkpoints, lambda s: self.progress(stage, s))
 
@@ -210,10 +208,10 @@ class _Job:
         fitted: dict[tuple[str, Actuator], FitResult],
         full: dict[Actuator, Problem],
         subsets: tuple[SubsetFit, ...],
-        values: Array,
         begin: float,
     ) -> Bounds:
         space = bounded.free_space
+        values = np.array([s.values for s in subsets])
         at = space.normalise(space.nominal)
         known = confidence_at(bounded, at)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
@@ -223,7 +221,7 @@ class _Job:
         upper = np.where(known.identified, upper, np.maximum(upper, known.upper))
         actuator = self.options.actuator
         main, nominal = full[actuator], fitted["nominal", actuator]
-        weights = [bounded.space.nominal[bounded.space.names.index(n)] for n in NETWORK_NAMES]
+        phi = [n for n in bounded.space.names if n in NETWORK_NAMES]
         return Bounds(
             robot=self.robot.name,
             actuator=actuator,
@@ -234,7 +232,7 @@ class _Job:
             ci90=np.stack([known.lower, known.upper], axis=1),
             identified=known.identified,
             correlation=known.correlation,
-            weights=np.array(weights if actuator == "nn_pd" else []),
+            weights=bounded.space.select(phi).nominal,
             train=_measured(main, nominal),
             held_out=self._held_out(full, fitted),
             subsets=subsets,
@@ -275,6 +273,23 @@ class _Job:
             "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
             "seconds": round(seconds, 1),
         }
+
+
+def _short(*parts: object) -> str:
+    """A few digits that identify the parts."""
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+
+def _subset_fit(problem: Problem, fit: FitResult, names: Sequence[str]) -> SubsetFit:
+    """A subset's fit of the bounded parameters; NaN for those its recordings cannot see."""
+    fitted = problem.values(fit.best[None])[0]
+    values = [fitted[problem.space.names.index(n)] if n in problem.free else np.nan for n in names]
+    return SubsetFit(
+        tuple(r.id for r in problem.recordings),
+        any(r.support == "ground" for r in problem.recordings),
+        float(problem.losses(fit.best[None])[0]),
+        np.array(values),
+    )
 
 
 def _measured(problem: Problem, fit: FitResult) -> dict[str, float]:

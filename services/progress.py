@@ -40,13 +40,21 @@ class _Clock:
     def __init__(self) -> None:
         self.stage, self.begin, self.first = "", 0.0, 0.0
 
-    def left(self, stage: str, share: float) -> str:
-        now = time.monotonic()
+    def told(self, stage: str, statuses: Sequence[Status]) -> str:
+        """How far a stage is, in words."""
+        now, share = time.monotonic(), _share(statuses)
         if stage != self.stage:
             self.stage, self.begin, self.first = stage, now, share
-        if share <= self.first:
-            return "?"
-        return _duration((now - self.begin) * (1 - share) / (share - self.first))
+        spent = now - self.begin
+        done = sum(s.done for s in statuses)
+        words = f"{stage}: {share:.0%}, {done}/{len(statuses)} fits done"
+        if done == len(statuses):
+            return f"{words} in {_duration(spent)}"
+        if share == 1:  # what is left of a fit after its generations is short and not counted
+            return f"{words}, the last steps left"
+        if share == self.first:
+            return words
+        return f"{words}, {_duration(spent * (1 - share) / (share - self.first))} left"
 
 
 def _duration(seconds: float) -> str:
@@ -68,19 +76,13 @@ class _Plain:
         self.clock, self.last = _Clock(), -math.inf
 
     def __call__(self, stage: str, statuses: Sequence[Status]) -> None:
-        share = _share(statuses)
-        left = self.clock.left(stage, share)
+        told = self.clock.told(stage, statuses)
         now = time.monotonic()
-        if now - self.last < PLAIN_SECONDS and share < 1:
+        if now - self.last < PLAIN_SECONDS and not all(s.done for s in statuses):
             return
         self.last = now
-        done = sum(s.generation >= s.generations for s in statuses)
         losses = " ".join(f"{s.name}={_loss(s)}" for s in statuses if s.generation)
-        print(
-            f"{stage}: {share:.0%}, {done}/{len(statuses)} fits done, {left} left  {losses}",
-            file=sys.stderr,
-            flush=True,
-        )
+        print(f"{told}  {losses}".rstrip(), file=sys.stderr, flush=True)
 
 
 class _Table:
@@ -88,9 +90,7 @@ class _Table:
         self.live, self.clock = live, _Clock()
 
     def __call__(self, stage: str, statuses: Sequence[Status]) -> None:
-        share = _share(statuses)
-        left = self.clock.left(stage, share)
-        table = Table(title=f"{stage}: {share:.0%}, {left} left", title_justify="left")
+        table = Table(title=self.clock.told(stage, statuses), title_justify="left")
         for column in ("fit", "generation", "loss"):
             table.add_column(column, justify="left" if column == "fit" else "right")
         for s in statuses:

@@ -11,6 +11,7 @@ from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import ParameterSpace, robot_space
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
+from pup.sysid.accuracy import JointUnits
 from pup.sysid.loss import ReplayLoss
 from pup.sysid.overlays import write_overlays
 from pup.sysid.result import read_fitted
@@ -26,8 +27,7 @@ def model_of(robot: RobotDescription, bounds: Path | None) -> tuple[Actuator, Pa
     """
     source = bounds or robot.identified_path
     if bounds is None and not source.exists():
-        actuator: Actuator = "pd" if robot.network is None else "nn_pd"
-        return actuator, robot_space(robot, actuator), "robot.toml"
+        return robot.actuator, robot_space(robot, robot.actuator), str(robot.folder / "robot.toml")
     actuator, space = read_fitted(source, robot)
     return actuator, space, str(source)
 
@@ -49,7 +49,7 @@ def replay(
       threads: cores to use.
 
     Returns:
-      The document of `replay.json`; errors in rad.
+      The document of `replay.json`; errors in its `unit`.
     """
     actuator, space, source = model_of(robot, bounds)
     simulator = MujocoSimulator(robot, recordings, actuator, threads)
@@ -61,6 +61,7 @@ def replay(
         "robot": robot.name,
         "actuator": actuator,
         "model": source,
+        "unit": JointUnits.of(robot, recordings).position,
         "rmse": _rms(errors),
         "loss": float(loss.total(loss.terms(trajectories))[0]),
         "per_joint": {n: _rms(e) for n, e in zip(robot.joint_names, errors.T, strict=True)},

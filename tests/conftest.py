@@ -6,6 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from refusals import Place
+
+from pup.robot import RobotDescription
+from pup.sysid.virtual import record
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -28,3 +32,25 @@ def check_contract(shared: Path) -> Callable[[Path], None]:
         assert done.returncode == 0, done.stdout + done.stderr
 
     return check
+
+
+@pytest.fixture(scope="session")
+def leg_recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two short recordings of a virtual `darwin_leg`; leave it as it is."""
+    folder = tmp_path_factory.mktemp("leg")
+    record(RobotDescription.load("darwin_leg"), ("step:0.1", "step:0.3"), folder, seed=3)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def bench_recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same of a virtual `servo_bench`."""
+    folder = tmp_path_factory.mktemp("bench")
+    record(RobotDescription.load("servo_bench"), ("step:0.1", "step:0.3"), folder, seed=3)
+    return folder
+
+
+@pytest.fixture
+def place(tmp_path: Path, leg_recordings: Path, bench_recordings: Path) -> Place:
+    """Where a case of bad input works."""
+    return Place(tmp_path, leg_recordings, bench_recordings)

@@ -27,6 +27,7 @@ from pup.sysid.result import Bounds, SubsetFit
 
 VOID = {"img", "meta"}
 TICKS = 12
+ROLL = np.full(TICKS, 3.1)
 
 
 class Page(HTMLParser):
@@ -140,8 +141,8 @@ def make_bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> B
         identified=identified,
         correlation=correlation,
         weights=np.zeros(27),
-        train={"loss": 1.2, "rmse": 0.0401},
-        held_out={"loss": 1.5, "rmse": 0.0522},
+        train={"loss": 1.2, "rmse": 0.0401, "rmse_before": 0.0912},
+        held_out={"loss": 1.5, "rmse": 0.0522, "folds": 3},
         subsets=tuple(
             SubsetFit((recordings[0].id,), bool(c), 1.0, f)
             for c, f in zip(contact, fits, strict=True)
@@ -149,7 +150,7 @@ def make_bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> B
         splits=splits,
         histories={"nn_pd": np.array([9.0, 2.0, 1.2]), "pd": np.array([4.0, 3.0, 2.9])},
         omitted=("no standing recording: foot term left out",),
-        provenance={"seed": 7, "versions": {"mujoco": "4.0.0"}, "held_out": ["b"]},
+        provenance={"seed": 7, "versions": {"mujoco": "4.0.0"}},
     )
 
 
@@ -240,7 +241,8 @@ def test_sections_stand_in_order(page: Page) -> None:
 def test_headline_tells_the_outcome(page: Page) -> None:
     assert "3 recordings (2 suspended, 1 on the ground)" in page.text
     assert "40.1 mrad (2.30°)" in page.text
-    assert "52.2 mrad (2.99°)" in page.text
+    assert "before the fit: 91.2 mrad (5.23°)" in page.text
+    assert "52.2 mrad (2.99°)each left out once, in 3 folds" in page.text
     assert "13 of 14" in page.text
     assert "not determined: rho/head" in page.text
     assert "No split found" in page.text
@@ -269,7 +271,11 @@ def test_unidentified_parameters_are_grey_and_say_so(page: Page, bounds: Bounds)
 def test_recordings_and_their_errors(page: Page) -> None:
     table = page.table("Recording")
     assert [row[0] for row in table[1:]] == ["a", "b", "c"]
-    assert [row[3] for row in table[1:]] == ["fit", "held out", "fit"]
+    assert [row[3:] for row in table[1:]] == [
+        ["step", "suspended", "0.55", "12"],
+        ["step", "suspended", "0.55", "12"],
+        ["fall", "ground", "0.55", "12"],
+    ]
     off = np.ones(20)
     off[:2] = 2, 0.5
     expected = f"{10 * np.sqrt(np.mean(off**2)):.1f}"
@@ -355,7 +361,7 @@ def test_single_recording_without_anything_else(
     page = report(tmp_path, bare, robot, (make_recording(robot, "only"),), {"PD": 0.02})
     for words in (
         "1 recording (1 suspended)",
-        "none held out",
+        "no recording was left out",
         "0 of 14",
         "bounds from no fits",
         "Could not be tested because no fits to subsets of the recordings were made.",
@@ -365,7 +371,6 @@ def test_single_recording_without_anything_else(
         "None was recorded.",
     ):
         assert words in page.text
-    assert "Used for" not in page.table("Recording")[0]
 
 
 def test_ground_without_imu(tmp_path: Path, bounds: Bounds, robot: RobotDescription) -> None:
@@ -383,16 +388,24 @@ def test_split_is_told_with_its_meaning(
     splits[at] = replace(splits[at], p_value=0.0004, two_clusters=0.0005)
     splits[1] = replace(splits[1], p_value=0.03)  # rho/head, not identified
     splits[2] = replace(splits[2], two_clusters=0.0005)
+    friction = bounds.space.names.index("ground_friction")
+    stuck = np.full(4, bounds.nominal[friction])
+    splits[friction] = replace(splits[friction], without=stuck, p_value=0.001, two_clusters=0.001)
     page = report(tmp_path, replace(bounds, splits=tuple(splits)), robot, recordings)
     assert (
         "rho/head (p = 0.0300) and torque_limit (p = 0.0004) take other values with ground contact"
         in page.text
     )
     assert "the model lacks something" in page.text
+    assert (
+        "The values of ground_friction differ too (p = 0.0010), but the subsets without contact "
+        "left it at its nominal value" in page.text
+    )
     assert "do not identify rho/head" in page.text
     assert "the values of rho/hip fall into two clusters" in page.text
     rows = {row[0]: row for row in page.tables[2][1:]}
     split = splits[at]
+    assert rows["ground_friction"][-1] == "not seen without contact"
     assert rows["torque_limit [N m]"][1:] == [
         wording.spread(split.without),
         wording.spread(split.with_contact),
@@ -460,8 +473,8 @@ def test_gaps_and_broken_simulations(
     assert len(write_overlays(tmp_path / "plots", robot, recordings, replay, loss)) == 2
 
 
-def test_accuracy_weighs_every_sample_the_same(robot: RobotDescription) -> None:
-    long = make_recording(robot, "a")
+def test_accuracy_weighs_every_recording_the_same(robot: RobotDescription) -> None:
+    long = make_recording(robot, "a", support="ground", extras=tilt(0.0) | {"imu/roll": ROLL})
     short = make_recording(
         robot, "b", time=long.time[:3], target=long.target[:3], position=long.position[:3]
     )
@@ -470,11 +483,13 @@ def test_accuracy_weighs_every_sample_the_same(robot: RobotDescription) -> None:
     position[:, loss.ticks[1]] += 0.1
     shape = position.shape[:2]
     ticks = tick_slices((long, short))
-    replay = Trajectories(ticks, position, np.zeros((*shape, 2)), np.zeros((*shape, 2, 3)))
+    replay = Trajectories(ticks, position, np.full((*shape, 2), -3.1), np.zeros((*shape, 2, 3)))
     measures = accuracy(loss, replay)
-    assert measures.total == pytest.approx(0.1 * np.sqrt(3 / (TICKS + 3)))
+    assert measures.total == pytest.approx(0.1 / np.sqrt(2))
     np.testing.assert_allclose(measures.per_recording, [0, 0.1], atol=1e-12)
-    assert np.isnan(measures.tilt).all()
+    np.testing.assert_allclose(measures.per_joint, 0.1 / np.sqrt(2))
+    around = 2 * np.pi - 6.2  # from 3.1 to -3.1 rad
+    np.testing.assert_allclose(measures.tilt, [[around, 3.1], [np.nan, np.nan]])
 
 
 def test_joints_told_to_stay_are_shown_only_as_the_worst(robot: RobotDescription) -> None:

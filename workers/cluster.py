@@ -1,16 +1,24 @@
 """The Ray that a job runs on: a cluster that is there, or one embedded in this process."""
 
 import os
+import signal
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from tempfile import mkdtemp
+from typing import Any
+from urllib.parse import urlsplit
 
 import ray
+from ray._private import ray_constants
+from ray._private import worker as ray_worker
 
 from pup.errors import InputError
 from workers import reaper
 
 OBJECT_STORE = 256 * 2**20  # bytes; the recordings are the largest object
+PROBE_SECONDS = 5.0
 
 
 @contextmanager
@@ -29,12 +37,16 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what newer Rays do
-    if address is None:
-        with _embedded(cores):
-            yield
-        return
+    with _messages(), _joined(address) if address else _embedded(cores):
+        yield
+
+
+@contextmanager
+def _joined(address: str) -> Iterator[None]:
+    _probe(address)
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        with _own_signals():
+            ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError) as error:
         told = " ".join(str(error).split())[:200]
         raise InputError(f"--address {address}: no Ray cluster answers there ({told})") from error
@@ -44,25 +56,95 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
         ray.shutdown()
 
 
+def _probe(address: str) -> None:
+    """Refuse an address where nothing listens: Ray would try again for over ten minutes."""
+    if address == "auto":
+        return
+    try:
+        place = urlsplit(address if "://" in address else f"//{address}")
+        host, port = place.hostname, place.port
+    except ValueError:
+        host = port = None
+    if not host or not port or place.scheme not in ("", "ray"):
+        raise InputError(f"--address {address}: expected host:port, ray://host:port or auto")
+    try:
+        socket.create_connection((host, port), PROBE_SECONDS).close()
+    except OSError as error:
+        told = error.strerror or error
+        raise InputError(f"--address {address}: no Ray cluster answers there ({told})") from error
+
+
 @contextmanager
 def _embedded(cores: int | None) -> Iterator[None]:
     folder = mkdtemp(prefix="pup-ray-")
     watch = reaper.start(folder)
     assert watch.stdin is not None
     try:
-        ray.init(
-            address="local",
-            num_cpus=cores,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level="ERROR",
-            object_store_memory=OBJECT_STORE,
-            _temp_dir=folder,
-            _node_ip_address="127.0.0.1",
-        )
+        with _own_signals(), _loopback():
+            ray.init(
+                address="local",
+                num_cpus=cores,
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level="ERROR",
+                object_store_memory=OBJECT_STORE,
+                _temp_dir=folder,
+                _node_ip_address="127.0.0.1",
+            )
         yield
     finally:
         ray.shutdown()
         watch.stdin.close()
         watch.wait()
         os.environ.pop(reaper.SESSION, None)
+
+
+@contextmanager
+def _messages() -> Iterator[None]:
+    """Have Ray tell of lost workers on standard error: standard output is for results.
+
+    The actors that a stopped job kills itself are not lost.
+    """
+    usual = ray_worker.print_to_stdstream
+
+    def tell(data: dict[str, Any], ignore_prefix: bool) -> None:
+        lines = [line for line in data["lines"] if "killed by `ray.kill`" not in line]
+        if lines:
+            usual(data | {"lines": lines, "is_err": True}, ignore_prefix)
+
+    ray_worker.print_to_stdstream = tell
+    try:
+        yield
+    finally:
+        ray_worker.print_to_stdstream = usual
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Keep this process's answer to SIGTERM: Ray puts one of its own in its place."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    own = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    except SystemExit:  # Ray's answer, while it starts
+        signal.signal(signal.SIGTERM, own)
+        signal.raise_signal(signal.SIGTERM)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, own)
+
+
+@contextmanager
+def _loopback() -> Iterator[None]:
+    """Keep Ray on the loopback interface; on Linux it takes another one even when told to.
+
+    So no other machine can talk to it, and it outlives a change of network.
+    """
+    usual = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = usual

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from ray.exceptions import RayError, RayTaskError
 
 from pup.sysid.fit import FitResult, FitSettings, run_fit
+from pup.sysid.polish import polish
 from pup.sysid.problem import Problem
 
 Array = NDArray[np.float64]
@@ -52,12 +54,14 @@ class Status:
       generation: generations done.
       generations: of how many.
       loss: best objective so far.
+      done: whether it has ended, what comes after the generations included.
     """
 
     name: str
     generation: int
     generations: int
     loss: float
+    done: bool = False
 
 
 Progress = Callable[[Sequence[Status]], None]
@@ -87,9 +91,17 @@ class LocalRunner:
 
             checkpoint = checkpoints / f"{fit.name}.npz"
             problem = fit.problem
-            results.append(
-                run_fit(fit.settings, problem.losses, checkpoint, report, problem.digest)
+            result = run_fit(
+                fit.settings,
+                problem.losses,
+                checkpoint,
+                report,
+                problem.digest,
+                partial(polish, problem.errors, anchor=fit.settings.anchor),
             )
+            results.append(result)
+            statuses[fit.name] = _done(fit, result)
+            progress(list(statuses.values()))
         return results
 
 
@@ -112,14 +124,15 @@ class RayRunner:
                 while waiting and len(running) < max(4, 2 * _cores()):
                     i, fit = waiting.pop()
                     digest = fit.problem.digest
-                    path = str(checkpoints / f"{fit.name}.npz")
+                    # Absolute: an actor's working directory is that of its node's Ray.
+                    path = str((checkpoints / f"{fit.name}.npz").absolute())
                     actor = FitActor.remote()  # type: ignore[attr-defined]
                     run = actor.run.remote([references[digest]], digest, fit.settings, path)
                     running[run] = (i, actor)
                 for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
                     i, _ = running.pop(reference)  # its actor ends with its last reference
                     results[i] = _result(reference)
-                    statuses[i] = _status(fits[i], len(results[i].history), results[i].loss)
+                    statuses[i] = _done(fits[i], results[i])
                 _poll(running.values(), fits, statuses)
                 progress(statuses)
         finally:
@@ -154,6 +167,11 @@ def _status(fit: Fit, generation: int, loss: float) -> Status:
     return Status(fit.name, generation, fit.settings.generations, loss)
 
 
+def _done(fit: Fit, result: FitResult) -> Status:
+    generations = fit.settings.generations
+    return Status(fit.name, generations, generations, result.loss, done=True)
+
+
 def _cores() -> int:
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
 
@@ -181,9 +199,20 @@ class FitActor:
         """
 
         def losses(unit: Array) -> Array:
-            return self._evaluate(problem, digest, unit)
+            return np.concatenate(self._evaluated("losses", problem, digest, unit))
 
-        return run_fit(settings, losses, Path(checkpoint), self._progress, digest)
+        def errors(unit: Array) -> tuple[Array, NDArray[np.int64]]:
+            parts = self._evaluated("errors", problem, digest, unit)
+            return np.concatenate([error for error, _ in parts]), parts[0][1]
+
+        return run_fit(
+            settings,
+            losses,
+            Path(checkpoint),
+            self._progress,
+            digest,
+            partial(polish, errors, anchor=settings.anchor),
+        )
 
     def status(self, share: int) -> tuple[int, float]:
         """Generations done and the best objective; takes the number of tasks to cut one into."""
@@ -195,26 +224,27 @@ class FitActor:
         with self.lock:
             self.state = (len(result.history), result.loss)
 
-    def _evaluate(self, problem: list[Any], digest: str, unit: Array) -> Array:
+    def _evaluated(self, what: str, problem: list[Any], digest: str, unit: Array) -> list[Any]:
+        """What some candidates evaluate to, in pieces of as many tasks as is worth it."""
         with self.lock:
             longest = max(1, int(len(unit) * self.cost / TASK_SECONDS)) if self.cost < np.inf else 1
             parts = min(self.share, longest, len(unit))
         pieces = np.array_split(unit, parts)
-        answers = ray.get([evaluate.remote(problem, digest, p) for p in pieces])
+        answers = ray.get([evaluate.remote(what, problem, digest, p) for p in pieces])
         self.cost = sum(seconds for _, seconds in answers) / len(unit)
-        return np.concatenate([losses for losses, _ in answers])
+        return [value for value, _ in answers]
 
 
 @ray.remote(num_cpus=1, max_retries=-1)
-def evaluate(problem: list[Any], digest: str, unit: Array) -> tuple[Array, float]:
-    """Losses of some candidates and the seconds they took."""
+def evaluate(what: str, problem: list[Any], digest: str, unit: Array) -> tuple[Any, float]:
+    """`losses` or `errors` of some candidates, and the seconds they took."""
     begin = time.perf_counter()
     if digest not in _PROBLEMS:
         if len(_PROBLEMS) >= CACHED_PROBLEMS:
             _PROBLEMS.clear()
         _PROBLEMS[digest] = ray.get(problem[0])
-    losses = _PROBLEMS[digest].losses(unit)
-    return losses, time.perf_counter() - begin
+    value = getattr(_PROBLEMS[digest], what)(unit)
+    return value, time.perf_counter() - begin
 
 
 _PROBLEMS: dict[str, Problem] = {}

@@ -42,7 +42,7 @@ class TorqueLaw(Protocol):
 
 
 def _clip(torque: Array, damping: Array, velocity: Array, limit: Array) -> None:
-    """Clip `torque - damping * velocity` to ±limit, in place; where it clips nothing is left to damp."""
+    """Clip `torque - damping * velocity` to ±limit, in place; clipped, nothing is left to damp."""
     total = torque - damping * velocity
     clipped = ~(np.abs(total) < limit)
     np.copysign(limit, total, out=torque, where=clipped)

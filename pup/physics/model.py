@@ -14,6 +14,12 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Selection = slice | NDArray[np.int64]
 
+# A simulation that breaks down is told by its trajectories, a model that is wrong by an exception.
+# MuJoCo would also print each, and write MUJOCO_LOG.TXT to wherever the user stands.
+_log = mujoco.MjLogConfig.get()
+_log.logto_console = _log.logto_file = False
+_log.set()
+
 
 @dataclass(frozen=True)
 class Model:

@@ -214,11 +214,11 @@ class _Run:
         if group.model.floating:
             self.places = self.batch.bind("xpos")
             self.sensor = _sensor_quaternion(robot, group.model)
-        self.delay = (
-            per_simulation["command_delay"] / robot.timestep
-            if "command_delay" in candidates
-            else None
-        )
+        self.delay: tuple[NDArray[np.int64], Array] | None = None
+        if "command_delay" in candidates:
+            delay = (per_simulation["command_delay"] / robot.timestep).reshape(-1, self.candidates)
+            whole = np.floor(delay).astype(np.int64)
+            self.delay = whole, (delay - whole)[:, :, None]
         self.ids = np.arange(nsim, dtype=np.int32)
         self.broken = np.zeros(nsim, dtype=bool)
 
@@ -252,9 +252,7 @@ class _Run:
         """Targets of the running recordings, shape (running, n_candidates or 1, n_joints)."""
         if self.delay is None:
             return self.group.target[step, :running, None]
-        delay = self.delay.reshape(-1, self.candidates)[:running]
-        whole = np.floor(delay).astype(np.int64)
-        share = (delay - whole)[:, :, None]
+        whole, share = (of[:running] for of in self.delay)
         row = np.arange(running)[:, None]
         newer = self.group.target[np.maximum(step - whole, 0), row]
         older = self.group.target[np.maximum(step - whole - 1, 0), row]

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 class Accuracy:
     """Root mean square errors of one candidate.
 
-    Every sample that was read counts the same, so long recordings count more than short ones.
-    For a sliding joint read m where rad stands.
+    Every recording and joint counts the same, however long. For a sliding joint read m where rad
+    stands.
 
     Attributes:
       cells: per recording and joint, shape (n_recordings, n_joints), rad.
@@ -50,14 +50,12 @@ def accuracy(loss: ReplayLoss, trajectories: Trajectories, row: int = 0) -> Accu
       trajectories: the replay of the same recordings.
       row: which candidate.
     """
-    counts = np.stack([(~np.isnan(loss.position[part])).sum(axis=0) for part in loss.ticks])
     cells = loss.rmse(trajectories)[row]
-    squares = cells**2 * counts
     return Accuracy(
         cells=cells,
-        per_recording=np.sqrt(squares.sum(axis=1) / counts.sum(axis=1)),
-        per_joint=np.sqrt(squares.sum(axis=0) / counts.sum(axis=0)),
-        total=float(np.sqrt(squares.sum() / counts.sum())),
+        per_recording=np.sqrt((cells**2).mean(axis=1)),
+        per_joint=np.sqrt((cells**2).mean(axis=0)),
+        total=float(np.sqrt((cells**2).mean())),
         tilt=np.stack([_tilt(loss, trajectories, row, i) for i in range(len(loss.recordings))]),
         diverged=trajectories.diverged[row],
     )
@@ -67,7 +65,8 @@ def _tilt(loss: ReplayLoss, trajectories: Trajectories, row: int, i: int) -> Arr
     if loss.recordings[i].support != "ground":
         return np.full(2, np.nan)
     measured, simulated = loss.tilt[loss.ticks[i]], trajectories.tilt[row, loss.ticks[i]]
-    error = np.where(np.isnan(simulated), LOST_POSITION, simulated - measured)
+    short = (simulated - measured + np.pi) % (2 * np.pi) - np.pi  # the short way round the circle
+    error = np.where(np.isnan(simulated), LOST_POSITION, short)
     known = ~np.isnan(measured)
     with np.errstate(invalid="ignore"):  # an angle that was never read gives NaN
         return np.asarray(np.sqrt((error**2).sum(axis=0, where=known) / known.sum(axis=0)))

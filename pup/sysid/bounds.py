@@ -34,13 +34,14 @@ def expanded_range(fits: Array, space: ParameterSpace) -> tuple[Array, Array]:
     """Per-parameter range of the subset fits, expanded by 10 % and kept in the search range.
 
     Args:
-      fits: physical values, shape (n_subsets, n_parameters).
+      fits: physical values, shape (n_subsets, n_parameters); NaN where a subset cannot see a
+        parameter, but each has at least one value.
       space: their space.
 
     Returns:
       Lower and upper bounds, shape (n_parameters,) each.
     """
-    low, high = fits.min(axis=0), fits.max(axis=0)
+    low, high = np.nanmin(fits, axis=0), np.nanmax(fits, axis=0)
     margin = EXPANSION * (high - low)
     return np.maximum(low - margin, space.lower), np.minimum(high + margin, space.upper)
 
@@ -80,7 +81,8 @@ def contact_splits(
     The paper saw one in the torque limit and took it for a sign of missing physics (section V-E).
 
     Args:
-      fits: physical values, shape (n_subsets, n_parameters).
+      fits: physical values, shape (n_subsets, n_parameters); NaN where a subset cannot see a
+        parameter.
       space: their space.
       contact: whether each subset contains a recording on the ground.
       seed: of the permutations.
@@ -88,33 +90,46 @@ def contact_splits(
     unit = space.normalise(fits)
     label = np.asarray(contact, dtype=bool)
     rng = np.random.default_rng(seed)
-    testable = 2 <= label.sum() <= len(label) - 2
-    observed = _separation(unit, label) if testable else np.full(len(space), np.nan)
-    p_values = np.full(len(space), np.nan)
-    if testable:
+    seen = ~np.isnan(unit)
+    testable = (seen[label].sum(axis=0) >= 2) & (seen[~label].sum(axis=0) >= 2)
+    observed, p_values = np.full((2, len(space)), np.nan)
+    if testable.any():
+        tested = unit[:, testable]
+        observed[testable] = _separation(tested, label)
         shuffled = (rng.permutation(label) for _ in range(PERMUTATIONS))
-        largest = np.array([np.abs(_separation(unit, s)).max() for s in shuffled])
-        p_values = np.array(
-            [(1 + (largest >= abs(o) - 1e-12).sum()) / (1 + PERMUTATIONS) for o in observed]
-        )
+        largest = np.array([np.nanmax(np.abs(_separation(tested, s))) for s in shuffled])
+        beyond = largest[:, None] >= np.abs(observed[testable]) - 1e-12
+        p_values[testable] = (1 + beyond.sum(axis=0)) / (1 + PERMUTATIONS)
     return [
         Split(
             name,
-            fits[label, i],
-            fits[~label, i],
+            fits[label & seen[:, i], i],
+            fits[~label & seen[:, i], i],
             float(observed[i]),
             float(p_values[i]),
-            two_cluster_p(unit[:, i], rng),
+            two_cluster_p(unit[seen[:, i], i], rng),
         )
         for i, name in enumerate(space.names)
     ]
 
 
 def _separation(unit: Array, label: NDArray[np.bool_]) -> Array:
-    """Difference of the two means over the pooled standard deviation, per parameter."""
-    a, b = unit[label], unit[~label]
-    pooled = np.sqrt((a.var(axis=0) * len(a) + b.var(axis=0) * len(b)) / len(unit))
-    return np.asarray((a.mean(axis=0) - b.mean(axis=0)) / np.maximum(pooled, 1e-3))
+    """Difference of the two means over the pooled standard deviation, per parameter.
+
+    NaN where one side has no value.
+    """
+    values = np.where(np.isnan(unit), 0.0, unit)
+    known = ~np.isnan(unit)
+    sides = []
+    for side in (label, ~label):
+        n = known[side].sum(axis=0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = values[side].sum(axis=0) / n
+        squares = (known[side] * (values[side] - np.nan_to_num(mean)) ** 2).sum(axis=0)
+        sides.append((mean, squares))
+    (a, within_a), (b, within_b) = sides
+    pooled = np.sqrt((within_a + within_b) / known.sum(axis=0))
+    return np.asarray((a - b) / np.maximum(pooled, 1e-3))
 
 
 def two_cluster_p(values: Array, rng: np.random.Generator, draws: int = 2000) -> float:

@@ -5,7 +5,7 @@ phone, and colours are Okabe and Ito's, which the colour-blind can tell apart.
 """
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -217,8 +217,13 @@ def correlation_matrix(bounds: Bounds) -> Drawing:
     return as_svg(figure)
 
 
-def split_values(bounds: Bounds) -> Drawing:
-    """Values of the subset fits with and without contact, in the normalised search range."""
+def split_values(bounds: Bounds, splitting: Collection[str]) -> Drawing:
+    """Values of the subset fits with and without contact, in the normalised search range.
+
+    Args:
+      bounds: their splits.
+      splitting: parameters to mark.
+    """
     figure = new_figure(WIDTH, 1.1 + ROW * len(bounds.splits) * 1.15)
     axes = figure.subplots()
     for row, split in enumerate(bounds.splits):
@@ -231,11 +236,12 @@ def split_values(bounds: Bounds) -> Drawing:
             unit = (values - low) / (high - low)
             axes.plot(
                 unit, np.full(len(unit), row + side), linestyle="", marker=marker, markersize=4,
-                color=colour, alpha=0.5, markeredgewidth=0, label=label if row == 0 else None,
+                color=colour, alpha=0.5, markeredgewidth=0,
+                label=label if row == 0 and len(unit) else None,
             )  # fmt: skip
             if len(unit):
                 axes.vlines(unit.mean(), row + side - 0.17, row + side + 0.17, color=colour, lw=1.6)
-        if split.split:
+        if split.name in splitting:
             axes.annotate(
                 "split", (1, row), xycoords=("axes fraction", "data"), xytext=(4, 0),
                 textcoords="offset points", va="center", color=RED, weight="bold",

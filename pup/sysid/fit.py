@@ -6,11 +6,12 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
 
 import nevergrad as ng
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from pup.errors import InputError
 from pup.files import write_atomic
@@ -92,10 +93,13 @@ class CmaFit:
     def __init__(self, settings: FitSettings, problem: str = "") -> None:
         self.settings = settings
         self.identity = f"{settings.digest} {problem}"
-        dimension = len(settings.start)
+        spare = max(
+            0, 2 - len(settings.start)
+        )  # CMA-ES wants two dimensions: one that does nothing
+        dimension = len(settings.start) + spare
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # steps wide for the box are what is asked for
-            start = np.clip(settings.start, 1e-6, 1 - 1e-6)
+            start = np.clip(np.append(settings.start, np.full(spare, 0.5)), 1e-6, 1 - 1e-6)
             array = ng.p.Array(init=start).set_mutation(sigma=0.1)
             array.set_bounds(0.0, 1.0, method="bouncing")
         array.random_state.seed(settings.seed)
@@ -110,6 +114,7 @@ class CmaFit:
         self._loss = np.inf
         self._history: list[float] = []
         self._told: list[Array] = []
+        self.polished: Array | None = None
 
     @property
     def generation(self) -> int:
@@ -124,14 +129,12 @@ class CmaFit:
     def ask(self) -> Array:
         """The next generation, shape (population, n_parameters), on the unit cube."""
         self._asked = [self._optimizer.ask() for _ in range(self.settings.population)]
-        return np.array([candidate.value for candidate in self._asked])
+        return self._values()
 
     def tell(self, losses: Array) -> None:
         """Report the losses of the generation asked last, shape (population,)."""
-        values = np.array([candidate.value for candidate in self._asked])
-        objective = losses
-        if self.settings.anchor is not None:
-            objective = losses + W_REG * ((values - self.settings.anchor) ** 2).sum(axis=1)
+        values = self._values()
+        objective = self._objective(values, losses)
         for candidate, value in zip(self._asked, objective, strict=True):
             self._optimizer.tell(candidate, float(value))
         best = int(np.argmin(objective))
@@ -140,10 +143,30 @@ class CmaFit:
         self._history.append(self._loss)
         self._told.append(np.array(losses))
 
+    def consider(self, value: Array, loss: float) -> None:
+        """Take a point outside the search into account: its result is never worse than this."""
+        objective = self._objective(value[None], np.array([loss]))[0]
+        if objective < self._loss:
+            self._loss, self._best = float(objective), value
+
+    def _values(self) -> Array:
+        """The generation asked last, shape (population, n_parameters)."""
+        return np.array([c.value[: len(self.settings.start)] for c in self._asked])
+
+    def _objective(self, values: Array, losses: Array) -> Array:
+        """The loss and the regulariser."""
+        if self.settings.anchor is None:
+            return losses
+        pull = ((values - self.settings.anchor) ** 2).sum(axis=1)
+        return np.asarray(losses + W_REG * pull)
+
     def save(self, path: Path) -> None:
         """Write the checkpoint atomically."""
         buffer = io.BytesIO()
-        np.savez(buffer, schema=1, fit=self.identity, losses=np.array(self._told))
+        arrays: dict[str, Any] = {"losses": np.array(self._told)}
+        if self.polished is not None:
+            arrays["polished"] = self.polished
+        np.savez(buffer, schema=1, fit=self.identity, **arrays)
         write_atomic(path, buffer.getvalue())
 
     def resume(self, path: Path) -> None:
@@ -155,7 +178,8 @@ class CmaFit:
         try:
             with np.load(path, allow_pickle=False) as saved:
                 identity, losses = str(saved["fit"]), saved["losses"]
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
+                polished = saved.get("polished")
+        except Exception as error:  # NumPy's reader raises what a torn file happens to hit
             raise InputError(
                 f"{path}: not a checkpoint of a fit; delete it to start again"
             ) from error
@@ -167,6 +191,8 @@ class CmaFit:
         for generation in losses[: self.settings.generations]:
             self.ask()
             self.tell(generation)
+        if len(losses) == self.settings.generations:
+            self.polished = polished
 
 
 def run_fit(
@@ -175,6 +201,7 @@ def run_fit(
     checkpoint: Path | None = None,
     progress: Callable[[FitResult], None] | None = None,
     problem: str = "",
+    polish: Callable[[Array], Array] | None = None,
 ) -> FitResult:
     """Run a fit to its last generation, from its checkpoint where there is one.
 
@@ -184,14 +211,24 @@ def run_fit(
       checkpoint: file written after every generation.
       progress: called after every generation.
       problem: identifies what is evaluated, see CmaFit.
+      polish: improves the best point of the search, on the unit cube, at its end.
     """
-    fit = CmaFit(settings, problem)
-    if checkpoint is not None and checkpoint.exists():
-        fit.resume(checkpoint)
-    while fit.generation < settings.generations:
-        fit.tell(evaluate(fit.ask()))
-        if checkpoint is not None:
-            fit.save(checkpoint)
-        if progress is not None:
-            progress(fit.result)
-    return fit.result
+    with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads, the fit must not
+        fit = CmaFit(settings, problem)
+        if checkpoint is not None and checkpoint.exists():
+            fit.resume(checkpoint)
+        while fit.generation < settings.generations:
+            fit.tell(evaluate(fit.ask()))
+            if checkpoint is not None:
+                fit.save(checkpoint)
+            if progress is not None:
+                progress(fit.result)
+        if polish is not None:
+            if fit.polished is None:
+                fit.polished = polish(fit.result.best)
+                if checkpoint is not None:
+                    fit.save(checkpoint)
+            fit.consider(fit.polished, float(evaluate(fit.polished[None])[0]))
+        # The first mean itself is never a candidate; a short search may not have found its like.
+        fit.consider(settings.start, float(evaluate(settings.start[None])[0]))
+        return fit.result

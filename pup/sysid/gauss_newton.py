@@ -18,10 +18,17 @@ Array = NDArray[np.float64]
 Residuals = Callable[[Array], Array]
 """Candidates (n, n_parameters) on the unit cube to weighted residuals (n, n_residuals)."""
 
-STEP = 0.01
-"""Finite-difference step on the unit cube: wide enough to smooth what friction and ticks kink."""
+STEPS = (1e-4, 1e-3, 1e-2)
+"""Finite-difference steps on the unit cube, the next one when the one before leads no further.
+
+A torque that clips and a foot that lands kink what a replay returns: a narrow difference sees one
+side of a kink, a wide one the slope across many.
+"""
+FIRST_DAMPING = 1e-2
 DAMPINGS = 10.0 ** np.arange(-3.0, 2.0)
 """Damping factors tried at once, relative to the current one."""
+HEAVIER = 1e5
+"""Relative damping of a second try, where none of the first improves."""
 IDENTIFIED_SHARE = 0.5
 """A parameter is identified when its 90 % interval covers at most this share of its range."""
 
@@ -73,6 +80,7 @@ def least_squares(
     prior_mean: Array | None = None,
     prior_sd: Array | None = None,
     tolerance: float = 1e-4,
+    step: float | None = None,
 ) -> LeastSquares:
     """Minimise the sum of squared residuals over the unit cube.
 
@@ -84,37 +92,40 @@ def least_squares(
       prior_sd: its standard deviations in units of the cube, for residuals of unit variance;
         infinite where there is none.
       tolerance: relative improvement of the cost below which it stops.
+      step: of the finite differences on the unit cube; without one, those of STEPS in turn.
     """
     prior = _Prior(start, prior_mean, prior_sd)
+    steps = STEPS if step is None else (step,)
     at = np.clip(start, 0.0, 1.0)
     value = residuals(at[None])[0]
     cost = prior.cost(value, at)
-    damping, replays, converged = 1e-2, 1, False
-    jacobian = np.empty((0, 0))
+    replays, width, damping, converged = 1, 0, FIRST_DAMPING, False
     for _ in range(iterations):
-        jacobian = _jacobian(residuals, at, value)
+        jacobian = _jacobian(residuals, at, value, steps[width])
         replays += len(at)
-        trials, factors = _trial_steps(jacobian, value, at, damping, prior)
-        values = residuals(trials)
-        replays += len(trials)
-        costs = np.array([prior.cost(v, t) for v, t in zip(values, trials, strict=True)])
-        pick = int(np.argmin(costs))
-        improvement = cost - costs[pick]
-        if improvement <= tolerance * cost:
-            if improvement > 0:
-                at, value, cost = trials[pick], values[pick], float(costs[pick])
-            if factors[pick] >= 1.0 or improvement > 0 or damping > 1e6:
-                converged = True
+        enough = cost - tolerance * cost
+        for factors in (DAMPINGS, HEAVIER * DAMPINGS):
+            trials = _trial_steps(jacobian, value, at, damping * factors, prior)
+            values = residuals(trials)
+            replays += len(trials)
+            costs = [prior.cost(v, t) for v, t in zip(values, trials, strict=True)]
+            pick = int(np.argmin(costs))
+            if costs[pick] < enough:
                 break
-            damping *= 1e3
-            continue
-        at, value, cost = trials[pick], values[pick], float(costs[pick])
-        damping = float(np.clip(damping * factors[pick], 1e-9, 1e9))
-    jacobian = _jacobian(residuals, at, value)
+        if costs[pick] < cost:
+            at, value, cost = trials[pick], values[pick], costs[pick]
+        if cost < enough:
+            damping = float(np.clip(damping * factors[pick], 1e-6, 1e6))
+        elif width + 1 < len(steps):
+            width, damping = width + 1, FIRST_DAMPING
+        else:
+            converged = True
+            break
+    jacobian = _jacobian(residuals, at, value, steps[-1])
     freedom = max(1, len(value) - len(at))
     noise = float(np.sqrt(value @ value / freedom))
     covariance = _covariance(jacobian, noise, prior)
-    return LeastSquares(at, float(cost), converged, replays + len(at), covariance, noise)
+    return LeastSquares(at, cost, converged, replays + len(at), covariance, noise)
 
 
 def confidence(space: ParameterSpace, fit: LeastSquares) -> Confidence:
@@ -142,36 +153,36 @@ class _Prior:
         return float(value @ value + pull @ pull) / 2
 
 
-def _jacobian(residuals: Residuals, at: Array, value: Array) -> Array:
+def _jacobian(residuals: Residuals, at: Array, value: Array, width: float) -> Array:
     """One-sided differences into the cube, one batch; shape (n_residuals, n_parameters)."""
-    step = np.where(at + STEP <= 1.0, STEP, -STEP)
+    step = np.where(at + width <= 1.0, width, -width)
     moved = at + np.diag(step)
     return np.asarray(((residuals(moved) - value) / step[:, None]).T)
 
 
-def _trial_steps(
-    jacobian: Array, value: Array, at: Array, damping: float, prior: _Prior
-) -> tuple[Array, Array]:
-    """Damped Gauss-Newton steps, those against a wall left out of the system."""
+def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, prior: _Prior) -> Array:
+    """Points of damped Gauss-Newton steps within the cube, shape (n_dampings, n_parameters)."""
     normal = jacobian.T @ jacobian + np.diag(prior.weight**2)
     gradient = jacobian.T @ value + prior.weight**2 * (at - prior.mean)
-    scale = np.maximum(np.diag(normal), 1e-12 * max(float(np.diag(normal).max()), 1e-300))
-    trials = []
-    for factor in DAMPINGS:
-        free = ~(((at <= 0) & (gradient > 0)) | ((at >= 1) & (gradient < 0)))
-        trial = at
-        for _ in range(3):  # a step into a wall is taken again along it
-            step = np.zeros(len(at))
-            system = normal + damping * factor * np.diag(scale)
-            if free.any():
-                step[free] = -np.linalg.solve(system[np.ix_(free, free)], gradient[free])
-            trial = at + step
-            beyond = free & (((trial < 0) & (at <= 0)) | ((trial > 1) & (at >= 1)))
-            if not beyond.any():
-                break
-            free &= ~beyond
-        trials.append(np.clip(trial, 0.0, 1.0))
-    return np.array(trials), DAMPINGS
+    scale = np.diag(normal)
+    scale = np.maximum(scale, 1e-12 * scale.max() or 1.0)
+    systems = normal + dampings[:, None, None] * np.diag(scale)
+    return np.array([_step_within(system, gradient, at) for system in systems])
+
+
+def _step_within(system: Array, gradient: Array, at: Array) -> Array:
+    """Where a Newton step leads; what hits a wall stays there and the rest is solved again."""
+    free = ~(((at <= 0) & (gradient > 0)) | ((at >= 1) & (gradient < 0)))
+    goal = at.copy()
+    while free.any():
+        pull = gradient[free] + system[np.ix_(free, ~free)] @ (goal - at)[~free]
+        goal[free] = at[free] - np.linalg.solve(system[np.ix_(free, free)], pull)
+        beyond = (goal < 0) | (goal > 1)
+        if not beyond.any():
+            break
+        goal = np.clip(goal, 0.0, 1.0)
+        free &= ~beyond
+    return goal
 
 
 def _covariance(jacobian: Array, noise: float, prior: _Prior) -> Array:

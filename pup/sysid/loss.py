@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ class Terms:
       position: sum over ticks of the norm of the joint position error, shape (n_candidates,
         n_recordings).
       tilt: the same of the torso's roll and pitch; 0 where a recording has none.
-      feet: the same of the feet's distance from where they started; 0 unless standing.
+      feet: the length of the path of the feet; 0 unless standing, m.
     """
 
     position: Array
@@ -65,14 +66,31 @@ class ReplayLoss:
 
     def terms(self, trajectories: Trajectories) -> Terms:
         """The three sums, per candidate and recording."""
-        first = np.repeat(self.starts, [p.stop - p.start for p in self.ticks])
-        moved = trajectories.feet - trajectories.feet[:, first]
-        still = np.zeros(moved[0, 0].size)
         return Terms(
             self._sum(_length(_difference(trajectories.position, self.position, LOST_POSITION))),
             self._sum(_length(self._tilt_error(trajectories))) * self.tilting,
-            self._sum(_length(_difference(_flat(moved), still, LOST_FOOT))) * self.standing,
+            self._sum(_length(self._feet_error(trajectories))) * self.standing,
         )
+
+    def weighted_errors(self, trajectories: Trajectories) -> tuple[Array, NDArray[np.int64]]:
+        """Errors with their weights in equation 1, in blocks whose norms add up to it.
+
+        Returns:
+          The errors, shape (n_candidates, n_errors), zero where nothing was measured, and where
+          each block begins, shape (n_blocks,).
+        """
+        parts, widths = [], []
+        for error, weight in (
+            (self.errors(trajectories)[0], np.ones(len(self.ticks))),
+            (self._tilt_error(trajectories), TILT_WEIGHT * self.tilting),
+            (self._feet_error(trajectories), FEET_WEIGHT * self.standing),
+        ):
+            if weight.any():
+                scale = self._per_tick(weight / np.count_nonzero(weight))
+                parts.append(np.nan_to_num(error) * scale[:, None])
+                widths += [error.shape[2]] * error.shape[1]
+        blocks = np.cumsum([0, *widths[:-1]])
+        return np.concatenate([p.reshape(len(p), -1) for p in parts], axis=1), blocks
 
     def total(self, terms: Terms, subset: Sequence[int] | None = None) -> Array:
         """Equation 1 over all recordings or a subset of them, shape (n_candidates,)."""
@@ -122,13 +140,27 @@ class ReplayLoss:
         """
         position = _difference(trajectories.position, self.position, LOST_POSITION)
         tilt = self._tilt_error(trajectories)
-        counts = np.repeat(self.tilting, [p.stop - p.start for p in self.ticks])
+        counts = self._per_tick(self.tilting)
         return np.nan_to_num(position), np.where(counts[:, None], np.nan_to_num(tilt), 0.0)
 
     def _tilt_error(self, trajectories: Trajectories) -> Array:
         """Errors of roll and pitch, the short way round the circle."""
         error = _difference(trajectories.tilt, self.tilt, LOST_POSITION)
         return (error + np.pi) % (2 * np.pi) - np.pi
+
+    def _feet_error(self, trajectories: Trajectories) -> Array:
+        """How far the feet moved since the tick before, (n_candidates, n_ticks, 3 n_feet), m.
+
+        Summed, that is the length of their path: it does not grow with the number of ticks, and a
+        foot that settles by a millimetre at the start counts that millimetre once.
+        """
+        flat = _flat(np.diff(trajectories.feet, axis=1, prepend=trajectories.feet[:, :1]))
+        flat[:, self.starts] *= 0.0  # no step from one recording to the next
+        return _difference(flat, np.zeros(flat.shape[2]), LOST_FOOT)
+
+    def _per_tick(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values per recording, repeated for each of its ticks."""
+        return np.repeat(values, [p.stop - p.start for p in self.ticks])
 
     def _sum(self, values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, self.starts, axis=1))

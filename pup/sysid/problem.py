@@ -85,6 +85,10 @@ class Problem:
         """Equation 1 of candidates (n, n_free), shape (n,)."""
         return self.loss.total(self.loss.terms(self.replay(unit)))
 
+    def errors(self, unit: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Weighted errors of candidates (n, n_free) and their blocks, see ReplayLoss."""
+        return self.loss.weighted_errors(self.replay(unit))
+
     def residuals(self, unit: Array) -> Array:
         """Position and tilt errors of candidates (n, n_free), shape (n, n_residuals).
 

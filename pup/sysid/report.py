@@ -46,10 +46,9 @@ def write_report(
 
     Args:
       path: the file.
-      bounds: what pre-sysID found. Where its provenance names recordings under `held_out`, the
-        table of recordings marks them.
+      bounds: what pre-sysID found.
       robot: the robot.
-      recordings: all recordings, those held out included.
+      recordings: what was fitted.
       replays: label such as `NN-PD`, `PD` or `authors` to the replay of one candidate over all
         recordings. The one of the fitted actuator picks what is shown; else the first.
       loss: the measurements of the same recordings in the same order.
@@ -109,22 +108,35 @@ class _Report:
             f"actuator; bounds from {fits} to random subsets.",
             class_="lead",
         )
-        held_out = words(bounds.held_out["rmse"]) if bounds.held_out else "none held out"
-        determined = tag("small", f"not determined: {wording.listed(vague)}") if vague else Html()
+        determined = f"not determined: {wording.listed(vague)}" if vague else ""
         yield tag(
             "dl",
-            _fact("Joint error, recordings fitted", words(bounds.train["rmse"])),
-            _fact("Joint error, recordings held out", held_out),
+            _fact("Joint error, recordings fitted", words(bounds.train["rmse"]), self.before()),
+            _fact("Joint error, recordings left out", *self.left_out()),
             _fact("Parameters the data determine", f"{count - len(vague)} of {count}", determined),
             class_="facts",
         )
         split = wording.split_words(bounds, self.recordings)
         yield tag("p", tag("strong", "Contact against suspended: "), split)
 
+    def before(self) -> str:
+        """The error at the robot's nominal values, where it is known."""
+        before = self.bounds.train.get("rmse_before")
+        return "" if before is None else f"before the fit: {self.units.words(before)}"
+
+    def left_out(self) -> tuple[str, str]:
+        """The error on recordings that a fit did not see, and how it was measured."""
+        measures = self.bounds.held_out
+        if measures is None:
+            return "not measured", "no recording was left out"
+        folds = measures.get("folds")
+        how = f"each left out once, in {folds:g} folds" if folds else ""
+        return self.units.words(measures["rmse"]), how
+
     def parameters(self) -> Iterator[Html]:
         """Table and figure of the bounds."""
         bounds, number = self.bounds, wording.number
-        columns = [Column("Parameter"), Column("Unit")]
+        columns = [Column("Parameter"), Column("Unit", "words")]
         columns += [Column(t, "number") for t in ("Nominal", "Lower", "Upper", "90 % interval")]
         rows = [
             (
@@ -147,9 +159,10 @@ class _Report:
         )
         yield tag(
             "p",
-            "Nominal: the fit to all recordings used. Lower and upper: the range of the fits to "
-            "random subsets, 10 % wider at both ends. 90 % interval: how far the nominal fit is "
-            "determined if the model is right.",
+            "Nominal: the fit to all recordings. Lower and upper: the range of this and of the "
+            "fits to random subsets, 10 % wider at both ends; where the recordings do not "
+            "identify a parameter, at least its 90 % interval. 90 % interval: how far the nominal "
+            "fit is determined if the model is right.",
         )
         if any(wording.at_edge(bounds)):
             yield tag(
@@ -176,8 +189,7 @@ class _Report:
         yield figure(
             convergence(known),
             f"Best loss over the generations of the nominal fit: {'; '.join(ends)}.",
-            "Best value so far of equation 1 with its regulariser, over the generations of the "
-            "nominal fit.",
+            "Best value of equation 1 so far, over the generations of the nominal fit.",
         )
 
     def motions(self) -> Iterator[Html]:
@@ -247,13 +259,10 @@ class _Report:
         yield figure(
             joint_errors(joints, per_joint, small),
             f"Bars of the RMSE per joint in {small}: {best}.",
-            "Root mean square error per joint over all recordings.",
+            "Root mean square error per joint over all recordings, each with the same weight.",
         )
-        held_out = self.bounds.provenance.get("held_out")
-        marked = set(held_out) if isinstance(held_out, list | tuple) else set()
         columns = [Column("Recording", "long")]
         columns += [Column(f"{label} [{small}]", "number") for label in self.labels]
-        columns += [Column("Used for", "words")] if marked else []
         columns += [Column("Motion"), Column("Support")]
         columns += [Column("Duration [s]", "number"), Column("Samples", "number")]
         columns += [Column("Setup", "words")] if any(r.setup for r in self.recordings) else []
@@ -263,7 +272,6 @@ class _Report:
             row += [
                 wording.error(a.per_recording[i], a.diverged[i]) for a in self.accuracies.values()
             ]
-            row += [["fit", "held out"][r.id in marked]] if marked else []
             row += [r.motion, r.support, f"{np.ptp(r.time):.2f}", str(len(r.time))]
             rows.append([*row, wording.setup(r)][: len(columns)])
         yield table(f"Root mean square joint error per recording, in {small}", columns, rows)
@@ -317,8 +325,10 @@ class _Report:
             return
         contact = [s.contact for s in self.bounds.subsets]
         named = wording.splitting(self.bounds)
+        marks = {n: f"not seen {side} contact" for n, side in wording.blind(self.bounds).items()}
+        marks |= dict.fromkeys(named, "split")
         yield figure(
-            split_values(self.bounds),
+            split_values(self.bounds, named),
             "Values of each parameter in the subset fits, those with contact beside those without; "
             f"split: {wording.listed(named) or 'none'}.",
             f"One mark per subset fit: {contact.count(False)} without contact, "
@@ -333,7 +343,7 @@ class _Report:
                 wording.spread(s.with_contact),
                 wording.p_value(s.p_value),
                 wording.p_value(s.two_clusters),
-                "split" if s.split else "",
+                marks.get(s.name, ""),
             )
             for s in splits
         ]
@@ -362,5 +372,5 @@ class _Report:
         yield table("How this came about", [Column("What"), Column("Value", "long")], rows)
 
 
-def _fact(name: str, value: str, *more: Html) -> Html:
-    return tag("div", tag("dt", name), tag("dd", value, *more))
+def _fact(name: str, value: str, more: str) -> Html:
+    return tag("div", tag("dt", name), tag("dd", value, *([tag("small", more)] if more else [])))

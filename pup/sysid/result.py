@@ -1,6 +1,5 @@
 """The outcome of pre-sysID and its file, `bounds.json` (CONTRACTS.md, section 4)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,8 @@ class SubsetFit:
       recordings: ids of the subset.
       contact: whether any of them is on the ground.
       loss: equation 1 over the subset, without the regulariser.
-      values: fitted bounded parameters, physical, shape (n_parameters,).
+      values: fitted bounded parameters, physical, shape (n_parameters,); NaN for those that the
+        subset's recordings cannot see.
     """
 
     recordings: tuple[str, ...]
@@ -54,7 +54,7 @@ class Bounds:
       held_out: the same on recordings left out, or None.
       subsets: the subset fits.
       splits: parameters tested for a split between subsets with and without contact.
-      histories: best objective per generation of the nominal fit of each actuator.
+      histories: best equation 1 so far, per generation of each actuator's nominal fit.
       omitted: what of equation 1 the recordings could not give, in words.
       provenance: how it came about.
     """
@@ -106,7 +106,8 @@ class Bounds:
         }
 
     def _named(self, values: Array) -> dict[str, float]:
-        return dict(zip(self.space.names, map(float, values), strict=True))
+        named = zip(self.space.names, map(float, values), strict=True)
+        return {name: value for name, value in named if not np.isnan(value)}
 
     def _parameter(self, i: int) -> dict[str, Any]:
         return {
@@ -155,22 +156,26 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
     try:
         if document["schema"] != SCHEMA:
             raise InputError(f"{path}: schema {document['schema']!r}; this pup reads {SCHEMA}")
+        if document["robot"] != robot.name:
+            raise InputError(f"{path}: bounds of robot {document['robot']!r}, not {robot.name!r}")
         kind = document["actuator"]["kind"]
         values = {p["name"]: float(p["nominal"]) for p in document["parameters"]}
-        weights: Sequence[float] = document["actuator"]["weights"]
-        space = robot_space(robot, kind)
-    except (KeyError, TypeError, ValueError) as error:
+        weights = [float(weight) for weight in document["actuator"]["weights"]]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not a bounds file ({type(error).__name__}: {error})") from error
-    if document.get("robot") != robot.name:
-        raise InputError(f"{path}: bounds of robot {document.get('robot')!r}, not {robot.name!r}")
-    unknown = sorted(set(values) - set(space.names))
+    try:
+        space = robot_space(robot, kind)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    unknown = [name for name in values if name not in space.names]
     if unknown:
         raise InputError(f"{path}: parameter {unknown[0]!r} is not one of robot {robot.name!r}")
     if kind == "nn_pd" and len(weights) != len(NETWORK_NAMES):
         raise InputError(f"{path}: {len(weights)} network weights, {len(NETWORK_NAMES)} expected")
-    values |= {n: float(w) for n, w in zip(NETWORK_NAMES, weights, strict=False)}
-    if not np.isfinite(list(values.values())).all():
-        raise InputError(f"{path}: a parameter is not a finite number")
+    values |= dict(zip(NETWORK_NAMES, weights, strict=False))
+    for name, value in values.items():
+        if not np.isfinite(value):
+            raise InputError(f"{path}: parameter {name!r} is {value}; expected a finite number")
     return kind, space.at(values)

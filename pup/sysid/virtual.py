@@ -16,7 +16,7 @@ from pup.files import write_json
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.simulator import Trajectories
-from pup.recording import Recording
+from pup.recording import Recording, write_recordings
 from pup.robot import RobotDescription
 from pup.sysid.excitation import Motion, joint_units, script
 from pup.sysid.result import read_fitted
@@ -259,8 +259,7 @@ def record(
     others = sorted(path.name for path in folder.glob("*.parquet") if path.name not in names)
     if others:
         raise InputError(f"{folder}: holds other recordings ({others[0]}); use an empty folder")
-    for recording in recordings:
-        recording.write(folder / f"{recording.id}.parquet")
+    write_recordings(recordings, folder)
     if truth is not None:
         complete = nominal_space(robot, actuator).at(parameters)
         write_json(

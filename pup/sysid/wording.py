@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 STRONG = 0.9
 """Estimates correlated more than this are named as one quantity seen twice."""
+UNMOVED = 0.02
+"""A subset's fit this near to the nominal value, in search ranges, did not move the parameter."""
 _PLACES = {"suspended": "suspended", "ground": "on the ground", "bench": "on a bench"}
 
 
@@ -62,8 +64,33 @@ def unidentified(bounds: Bounds) -> list[str]:
 
 
 def splitting(bounds: Bounds) -> list[str]:
-    """Names of the parameters that split between subsets with and without contact."""
-    return [split.name for split in bounds.splits if split.split]
+    """Names of the parameters that split between subsets with and without contact.
+
+    Those that one side does not see are not among them: see `blind`.
+    """
+    unseen = blind(bounds)
+    return [split.name for split in bounds.splits if split.split and split.name not in unseen]
+
+
+def blind(bounds: Bounds) -> dict[str, str]:
+    """Parameters that differ because one side leaves them where the subset fits start and end.
+
+    A subset's fit is pulled to the nominal point, so recordings that say nothing of a parameter
+    return its nominal value; that is no second value.
+
+    Returns:
+      Name to the side that does not see it, `with` or `without`.
+    """
+    found = {}
+    nominal = bounds.space.normalise(bounds.nominal)
+    for split in bounds.splits:
+        at = bounds.space.names.index(split.name)
+        width = bounds.space.upper[at] - bounds.space.lower[at]
+        for side, values in (("without", split.without), ("with", split.with_contact)):
+            unit = (values - bounds.space.lower[at]) / width
+            if split.split and np.abs(unit - nominal[at]).max(initial=0.0) < UNMOVED:
+                found[split.name] = side
+    return found
 
 
 def tested(bounds: Bounds) -> bool:
@@ -93,9 +120,8 @@ def split_words(bounds: Bounds, recordings: Sequence[Recording]) -> str:
     """What came of the test for a split, in one sentence."""
     if not tested(bounds):
         return f"Could not be tested because {why_untested(bounds, recordings)}."
-    found = [
-        f"{split.name} (p = {p_value(split.p_value)})" for split in bounds.splits if split.split
-    ]
+    p_values = {split.name: p_value(split.p_value) for split in bounds.splits}
+    found = [f"{name} (p = {p_values[name]})" for name in splitting(bounds)]
     if not found:
         return "No split found between subset fits with and without ground contact."
     takes = "takes" if len(found) == 1 else "take"
@@ -104,7 +130,8 @@ def split_words(bounds: Bounds, recordings: Sequence[Recording]) -> str:
 
 def split_meaning(bounds: Bounds) -> list[str]:
     """What the result of the test means, a paragraph each."""
-    found, vague = splitting(bounds), unidentified(bounds)
+    found, unseen, vague = splitting(bounds), blind(bounds), unidentified(bounds)
+    p_values = {split.name: p_value(split.p_value) for split in bounds.splits}
     paragraphs = []
     if found:
         plural = len(found) > 1
@@ -127,8 +154,12 @@ def split_meaning(bounds: Bounds) -> list[str]:
             "One value of each parameter serves both kinds of recordings as far as these fits "
             "can tell. With few subsets on either side only large differences would show."
         )
-    clusters = two_clusters(bounds)
-    other = [name for name in clusters if name not in found]
+    paragraphs += [
+        f"The values of {name} differ too (p = {p_values[name]}), but the subsets {side} contact "
+        "left it at its nominal value: they do not see it, so this is no second value."
+        for name, side in unseen.items()
+    ]
+    other = [n for n in two_clusters(bounds) if n not in found and n not in unseen]
     if other:
         paragraphs.append(
             f"Without regard to contact, the values of {listed(other)} fall into two clusters: "

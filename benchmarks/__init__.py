@@ -1,0 +1,1 @@
+"""Measurements that stand behind numbers in the documentation; each module is one command."""

@@ -1,0 +1,179 @@
+"""Fits on a real Ray: the same to the last bit as in one process, whatever is killed meanwhile."""
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+ray = pytest.importorskip("ray")
+
+from pup.errors import InputError  # noqa: E402
+from pup.physics.parameters import robot_space  # noqa: E402
+from pup.robot import RobotDescription  # noqa: E402
+from pup.sysid.fit import FitResult, FitSettings  # noqa: E402
+from pup.sysid.problem import Problem  # noqa: E402
+from pup.sysid.virtual import record  # noqa: E402
+from workers import fits as module  # noqa: E402
+from workers.cluster import connected  # noqa: E402
+from workers.fits import Fit, LocalRunner, RayRunner, Status  # noqa: E402
+
+pytestmark = pytest.mark.ray
+GENERATIONS = 16
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory: pytest.TempPathFactory) -> list[Fit]:
+    """Three fits of a leg, one of them pulled to its start."""
+    robot = RobotDescription.load("darwin_leg")
+    recordings = record(robot, ["step"], tmp_path_factory.mktemp("recordings"), 7)
+    space = robot_space(robot, "pd")
+    problem = Problem(robot, tuple(recordings), "pd", space, space.names)
+    start = space.normalise(space.nominal)
+    return [
+        Fit("all", problem, FitSettings(start, 0.25, 8, GENERATIONS, seed=1)),
+        Fit("few", problem.of([0]), FitSettings(start, 0.1, 7, GENERATIONS, seed=2)),
+        Fit("near", problem.of([1, 2]), FitSettings(start, 0.05, 8, GENERATIONS, 3, start)),
+    ]
+
+
+@pytest.fixture(scope="module")
+def wanted(fits: list[Fit], tmp_path_factory: pytest.TempPathFactory) -> list[FitResult]:
+    return LocalRunner().run(fits, tmp_path_factory.mktemp("local"), lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def embedded() -> Iterator[None]:
+    with connected(cores=2):
+        yield
+
+
+def assert_same(results: Sequence[FitResult], wanted: Sequence[FitResult]) -> None:
+    for result, one in zip(results, wanted, strict=True):
+        assert result.loss == one.loss
+        assert np.array_equal(result.best, one.best)
+        assert np.array_equal(result.history, one.history)
+
+
+class Once:
+    """Does something when the fits have come to some generation."""
+
+    def __init__(self, generation: int, deed: Callable[[], Any]) -> None:
+        self.generation, self.deed, self.done = generation, deed, False
+        self.seen: list[list[Status]] = []
+
+    def __call__(self, statuses: Sequence[Status]) -> None:
+        self.seen.append(list(statuses))
+        if not self.done and max(s.generation for s in statuses) >= self.generation:
+            self.done = True
+            self.deed()
+
+
+def workers_named(name: str) -> list[psutil.Process]:
+    """Processes of the embedded Ray of this process whose title begins so."""
+    return [p for p in psutil.Process().children(recursive=True) if p.name().startswith(name[:15])]
+
+
+def kill_one(name: str) -> None:
+    deadline = time.monotonic() + 30
+    while not (found := workers_named(name)):
+        assert time.monotonic() < deadline, f"no process {name}"
+        time.sleep(0.002)
+    found[0].send_signal(signal.SIGKILL)
+
+
+def test_the_same_as_in_one_process(
+    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
+) -> None:
+    told = Once(1, lambda: None)
+    assert_same(RayRunner().run(fits, tmp_path, told), wanted)
+    assert [s.name for s in told.seen[-1]] == ["all", "few", "near"]
+    assert all(s.done and s.generation == GENERATIONS for s in told.seen[-1])
+    for before, after in zip(told.seen, told.seen[1:], strict=False):
+        for a, b in zip(before, after, strict=True):
+            assert a.generation <= b.generation
+
+
+def test_a_finished_fit_is_not_fitted_again(
+    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
+) -> None:
+    """Checkpoints of one runner are good for the other."""
+    LocalRunner().run(fits, tmp_path, lambda _: None)
+    written = {f: f.stat().st_mtime_ns for f in tmp_path.iterdir()}
+    assert_same(RayRunner().run(fits, tmp_path, lambda _: None), wanted)
+    assert written == {f: f.stat().st_mtime_ns for f in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("share", [1, 3, 8, 100])
+def test_the_number_of_tasks_changes_nothing(
+    embedded: None,
+    fits: list[Fit],
+    wanted: list[FitResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    share: int,
+) -> None:
+    """A generation cut for any number of cores, down to single candidates."""
+    monkeypatch.setattr(module, "_cores", lambda: share)
+    monkeypatch.setattr(module, "POLL_SECONDS", 0.02)
+    assert_same(RayRunner().run(fits[1:2], tmp_path, lambda _: None), wanted[1:2])
+
+
+@pytest.mark.parametrize("generation", [1, 10])
+def test_a_killed_worker_changes_nothing(
+    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path, generation: int
+) -> None:
+    kill = Once(generation, lambda: kill_one("ray::evaluate"))
+    assert_same(RayRunner().run(fits, tmp_path, kill), wanted)
+    assert kill.done
+
+
+@pytest.mark.parametrize("generation", [1, 10])
+def test_a_killed_actor_resumes_from_its_checkpoint(
+    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path, generation: int
+) -> None:
+    kill = Once(generation, lambda: kill_one("ray::FitActor"))
+    assert_same(RayRunner().run(fits, tmp_path, kill), wanted)
+    assert kill.done
+
+
+def test_what_is_wrong_with_an_input_is_told_as_such(
+    embedded: None, fits: list[Fit], tmp_path: Path
+) -> None:
+    (tmp_path / "few.npz").write_bytes(b"torn")
+    with pytest.raises(InputError, match=r"few\.npz: not a checkpoint"):
+        RayRunner().run(fits, tmp_path, lambda _: None)
+    deadline = time.monotonic() + 20
+    while workers_named("ray::FitActor"):  # those of the other fits are gone too
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def test_a_stopped_runner_leaves_nothing_running_and_resumes(
+    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
+) -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        RayRunner().run(fits, tmp_path, Once(5, stop))
+    deadline = time.monotonic() + 20
+    while workers_named("ray::FitActor") or workers_named("ray::evaluate"):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert_same(RayRunner().run(fits, tmp_path, lambda _: None), wanted)
+
+
+def test_more_fits_than_run_at_once(embedded: None, fits: list[Fit], tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    many = [
+        Fit(f"f{i}", fits[1].problem, replace(fits[1].settings, generations=2, seed=i))
+        for i in range(7)
+    ]
+    local = LocalRunner().run(many, tmp_path / "local", lambda _: None)
+    assert_same(RayRunner().run(many, tmp_path / "ray", lambda _: None), local)
