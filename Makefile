@@ -1,5 +1,6 @@
 # Two commands, each doing all of its set-up on a fresh machine:
-#   make run    the main job; RECORDINGS=DIR ROBOT=NAME take your own data, ARGS=... passes options on
+#   make run    the main job; RECORDINGS=DIR ROBOT=NAME take your own data, FORMAT=NAME imports it
+#               first (csv, mcap, darwin-hardware, ...), ARGS=... passes options on
 #   make test   linters, types, import floors and the tests
 PYTHON ?= python3.11
 VENV := .venv
@@ -14,8 +15,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
 	touch $@
 
+IMPORTED := $(if $(FORMAT),$(OUT)/recordings,$(RECORDINGS))
+
 run: $(VENV)/.installed
-	$(BIN)/pup run --out $(OUT) $(if $(RECORDINGS),--recordings $(RECORDINGS) --robot $(ROBOT)) $(ARGS)
+	$(if $(FORMAT),$(BIN)/pup import $(FORMAT) $(RECORDINGS) --robot $(ROBOT) --out $(IMPORTED))
+	$(BIN)/pup run --out $(OUT) --robot $(ROBOT) $(if $(RECORDINGS),--recordings $(IMPORTED)) $(ARGS)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,34 +11,31 @@ import numpy as np
 import psutil
 import pytest
 
-ray = pytest.importorskip("ray")
-
-from pup.errors import InputError  # noqa: E402
-from pup.physics.parameters import robot_space  # noqa: E402
-from pup.robot import RobotDescription  # noqa: E402
-from pup.sysid.fit import FitResult, FitSettings  # noqa: E402
-from pup.sysid.problem import Problem  # noqa: E402
-from pup.sysid.virtual import record  # noqa: E402
-from workers import fits as module  # noqa: E402
-from workers.cluster import connected  # noqa: E402
-from workers.fits import Fit, LocalRunner, RayRunner, Status  # noqa: E402
+from pup.errors import InputError
+from pup.physics.parameters import robot_space
+from pup.recording import load_recordings
+from pup.robot import RobotDescription
+from pup.sysid.fit import FitResult, FitSettings
+from pup.sysid.problem import Problem
+from workers import fits as module
+from workers.cluster import connected
+from workers.fits import Fit, LocalRunner, RayRunner, Status
 
 pytestmark = pytest.mark.ray
 GENERATIONS = 16
 
 
 @pytest.fixture(scope="module")
-def fits(tmp_path_factory: pytest.TempPathFactory) -> list[Fit]:
+def fits(leg_recordings: Path) -> list[Fit]:
     """Three fits of a leg, one of them pulled to its start."""
     robot = RobotDescription.load("darwin_leg")
-    recordings = record(robot, ["step"], tmp_path_factory.mktemp("recordings"), 7)
     space = robot_space(robot, "pd")
-    problem = Problem(robot, tuple(recordings), "pd", space, space.names)
+    problem = Problem(robot, load_recordings([leg_recordings]), "pd", space, space.names)
     start = space.normalise(space.nominal)
     return [
         Fit("all", problem, FitSettings(start, 0.25, 8, GENERATIONS, seed=1)),
         Fit("few", problem.of([0]), FitSettings(start, 0.1, 7, GENERATIONS, seed=2)),
-        Fit("near", problem.of([1, 2]), FitSettings(start, 0.05, 8, GENERATIONS, 3, start)),
+        Fit("near", problem.of([1]), FitSettings(start, 0.05, 8, GENERATIONS, 3, start)),
     ]
 
 
@@ -169,8 +167,6 @@ def test_a_stopped_runner_leaves_nothing_running_and_resumes(
 
 
 def test_more_fits_than_run_at_once(embedded: None, fits: list[Fit], tmp_path: Path) -> None:
-    from dataclasses import replace
-
     many = [
         Fit(f"f{i}", fits[1].problem, replace(fits[1].settings, generations=2, seed=i))
         for i in range(7)
