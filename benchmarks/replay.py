@@ -2,10 +2,13 @@
 
 Against the engine: the same number of simulations of the same model, over the same sub-steps,
 those of ended recordings left out in the same way, on the same number of threads. The bare loop is
-one `mujoco.batch.Batch` that steps with constant controls and no torque law, no model fields of its
-own per simulation, nothing read or written; its making is not counted, while the replay's time has
-everything in it. Springs hold each robot where its recording starts: limp it would lie on the floor
-with half as many contacts again and make the engine look slow.
+one `mujoco.batch.Batch` on all threads with no torque law and no bookkeeping; its making is not
+counted, while the replay's time has everything in it.
+
+Suspended, the bare loop's controls are constant (none; springs hold each recording's first pose)
+and all its simulations share one model. On the ground the engine's time hangs on what touches: limp
+or held, a robot has other contacts than in the replay. There the bare loop is given the replay's
+own torques, known beforehand, and goes through the same motion.
 """
 
 import copy
@@ -18,6 +21,8 @@ import mujoco.batch
 import numpy as np
 
 from benchmarks.paired import ROBOT, Cost, Report, in_turn, parser, ratio, shipped
+from pup.physics.actuators import LAWS, Array
+from pup.physics.fields import apply_fields, scaled
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import Candidates, robot_space
 from pup.robot import RobotDescription
@@ -54,9 +59,9 @@ def _against_engine(
     simulator: MujocoSimulator, actuator: str, count: int, rounds: int
 ) -> dict[str, object]:
     candidates = _candidates(simulator.robot, actuator, count)
-    replays, bares = in_turn(
-        [lambda: simulator.replay(candidates), _bare(simulator, count)], rounds
-    )
+    ground = simulator.recordings[0].support == "ground"
+    bare = _bare_informed(simulator, actuator, candidates) if ground else _bare(simulator, count)
+    replays, bares = in_turn([lambda: simulator.replay(candidates), bare], rounds)
     return {
         "support": simulator.recordings[0].support,
         "actuator": actuator,
@@ -81,6 +86,7 @@ def _line(row: dict[str, object]) -> str:
 
 
 def _bare(simulator: MujocoSimulator, count: int) -> Callable[[], None]:
+    """A loop of the engine with constant controls."""
     (group,) = simulator.groups
     model = copy.copy(group.model.compiled)
     joints = [model.joint(name).id for name in simulator.robot.joint_names]
@@ -96,6 +102,47 @@ def _bare(simulator: MujocoSimulator, count: int) -> Callable[[], None]:
         batch.state[:] = state
         for running in group.running:
             batch.step(ids=ids[: running * count])
+
+    return run
+
+
+def _bare_informed(
+    simulator: MujocoSimulator, actuator: str, candidates: Candidates
+) -> Callable[[], None]:
+    """A loop of the engine through the motion of a replay."""
+    (group,) = simulator.groups
+    robot, dofs, inner = simulator.robot, group.model.dofs, LAWS[actuator]
+    torques: list[tuple[Array, Array]] = []
+
+    class Kept:
+        """A torque law that keeps what it says."""
+
+        def __init__(self, robot: RobotDescription, candidates: Candidates) -> None:
+            self.law = inner(robot, candidates)
+            self.armature = self.law.armature
+
+        def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
+            torque, damping = self.law.torque(error, velocity)
+            torques.append((torque.copy(), damping.copy()))
+            return torque, damping
+
+    alone = MujocoSimulator(robot, simulator.recordings, actuator)  # one thread: one batch
+    alone.law = Kept  # type: ignore[assignment]
+    alone.replay(candidates)
+    per_simulation = scaled(robot, candidates, group.setups)
+    batch = mujoco.batch.Batch(group.model.compiled, len(per_simulation), simulator.threads)
+    armature = inner(robot, per_simulation).armature
+    apply_fields(batch, robot, group.model, per_simulation, group.setups, armature)
+    batch.qpos[:] = np.repeat(group.start, len(candidates), axis=0)
+    force, damper = batch.bind("qfrc_applied"), batch.expand("dof_damping")
+    state, ids = batch.state.copy(), np.arange(len(per_simulation), dtype=np.int32)
+
+    def run() -> None:
+        batch.state[:] = state
+        for torque, damping in torques:
+            n = len(torque)
+            force[:n, dofs], damper[:n, dofs] = torque, damping
+            batch.step(ids=ids[:n])
 
     return run
 

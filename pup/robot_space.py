@@ -6,6 +6,8 @@ from pup.robot_toml import Table, listed
 
 BOTH: tuple[Actuator, ...] = ("nn_pd", "pd")
 # Kinds of parameters and the actuator models that know them: one per group (`kp/hip`), ...
+SIGNED_KINDS = frozenset(("torso_com", "com"))
+"""Parameters that may be negative: offsets."""
 GROUP_KINDS: dict[str, tuple[Actuator, ...]] = {
     "rho": ("nn_pd",),
     "sigma": ("nn_pd",),
@@ -69,6 +71,8 @@ def read_parameters(
             raise entry.mistake(
                 "nominal", f"{nominal:g} is outside search = [{search[0]:g}, {search[1]:g}]"
             )
+        if kind not in SIGNED_KINDS and search[0] < 0:
+            raise entry.mistake("search", f"{search[0]:g}: {kind} cannot be negative")
         known = _actuators_of(entry, name, groups, model)
         if kind == "torso_com" and torso is None:
             raise entry.mistake(

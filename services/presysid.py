@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.physics.parameters import NETWORK_NAMES, robot_space
+from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
-from pup.sysid.bounds import contact_splits, draw_subsets, expanded_range
+from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range
 from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
@@ -165,15 +165,17 @@ class _Job:
         )
 
     def _folds(self) -> list[tuple[int, ...]]:
-        """Recordings kept in each fold; those left out are spread over the motion types."""
-        order = sorted(
-            range(len(self.recordings)),
-            key=lambda i: (self.recordings[i].motion, self.recordings[i].id),
-        )
+        """Recordings kept in each fold.
+
+        Whole motion types are left out where there are enough of them; else recordings, spread
+        over the types, a repeat always together with what it repeats.
+        """
         folds = self.options.folds
-        return [
-            tuple(sorted(i for at, i in enumerate(order) if at % folds != k)) for k in range(folds)
-        ]
+        motions = {r.motion for r in self.recordings}
+        original = [(r.motion, r.repeat_of or r.id) for r in self.recordings]
+        unit = [r.motion for r in self.recordings] if len(motions) >= folds else original
+        rank = {u: at for at, u in enumerate(sorted(set(unit)))}
+        return [tuple(i for i, u in enumerate(unit) if rank[u] % folds != k) for k in range(folds)]
 
     def _subsets(self, bounded: Problem) -> tuple[SubsetFit, ...]:
         """Algorithm 1's fits, each over the bounded parameters that its recordings can see."""
@@ -236,11 +238,20 @@ class _Job:
             train=_measured(main, nominal),
             held_out=self._held_out(full, fitted),
             subsets=subsets,
-            splits=tuple(contact_splits(values, space, [s.contact for s in subsets])),
+            splits=self._splits(values, space, subsets),
             histories={a: fitted["nominal", a].history for a in full},
             omitted=tuple(main.loss.omitted()),
             provenance=self._provenance(time.time() - begin),
         )
+
+    def _splits(
+        self, values: Array, space: ParameterSpace, subsets: tuple[SubsetFit, ...]
+    ) -> tuple[Split, ...]:
+        """Parameters that take other values where subsets contain contact."""
+        index = {r.id: i for i, r in enumerate(self.recordings)}
+        members = [[index[i] for i in s.recordings] for s in subsets]
+        ground = [r.support == "ground" for r in self.recordings]
+        return tuple(contact_splits(values, space, members, ground, self.options.seed))
 
     def _held_out(
         self,

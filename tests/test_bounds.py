@@ -64,13 +64,18 @@ def test_a_subset_that_cannot_see_a_parameter_does_not_count() -> None:
     assert upper == pytest.approx([6.2, 1.72, 1.11])
 
 
+def singles(contact: list[bool]) -> list[tuple[int]]:
+    """Subsets of one recording each, so that fits are independent."""
+    return [(i,) for i in range(len(contact))]
+
+
 def test_a_bipolar_parameter_is_found() -> None:
     """As in the paper: another torque limit where the robot touches the ground."""
     rng = np.random.default_rng(5)
     contact = half_and_half(16)
     fits = SPACE.nominal + rng.normal(0, [0.5, 0.1, 0.05], (16, 3))
     fits[:, 1] += np.where(contact, -0.5, 0.5)
-    kp, limit, mass = contact_splits(fits, SPACE, contact)
+    kp, limit, mass = contact_splits(fits, SPACE, singles(contact), contact)
     assert limit.split and not kp.split and not mass.split
     assert limit.p_value < 0.01
     assert limit.separation < -4  # with contact it is lower
@@ -86,7 +91,7 @@ def test_a_split_that_only_some_subsets_can_see_is_found() -> None:
     fits = SPACE.nominal + rng.normal(0, [0.5, 0.1, 0.05], (20, 3))
     fits[:, 1] += np.where(contact, -0.5, 0.5)
     fits[::4, 1] = np.nan
-    _, limit, _ = contact_splits(fits, SPACE, contact)
+    _, limit, _ = contact_splits(fits, SPACE, singles(contact), contact)
     assert limit.split
     assert len(limit.with_contact) + len(limit.without) == 15
 
@@ -94,7 +99,7 @@ def test_a_split_that_only_some_subsets_can_see_is_found() -> None:
 @pytest.mark.parametrize("contact", [[False] * 6, [True] * 6, [True] + [False] * 5])
 def test_without_two_fits_on_each_side_nothing_is_tested(contact: list[bool]) -> None:
     fits = SPACE.nominal + np.random.default_rng(0).normal(0, 0.1, (6, 3))
-    for split in contact_splits(fits, SPACE, contact):
+    for split in contact_splits(fits, SPACE, singles(contact), contact):
         assert np.isnan(split.p_value)
         assert not split.split
 
@@ -104,7 +109,7 @@ def test_a_parameter_seen_on_one_side_alone_is_not_tested() -> None:
     contact = half_and_half(12)
     fits = SPACE.nominal + np.random.default_rng(0).normal(0, 0.1, (12, 3))
     fits[~np.array(contact), 2] = np.nan
-    kp, _, mass = contact_splits(fits, SPACE, contact)
+    kp, _, mass = contact_splits(fits, SPACE, singles(contact), contact)
     assert np.isnan(mass.p_value) and not mass.split
     assert np.isfinite(kp.p_value)
 
@@ -122,7 +127,7 @@ def test_false_alarms_are_rare(monkeypatch: pytest.MonkeyPatch) -> None:
     for seed in range(300):
         fits = 0.5 + 0.03 * rng.standard_t(4, size=(10, 14)) @ mixing
         contact = list(rng.permutation([True] * 4 + [False] * 6))
-        splits = contact_splits(fits, space, contact, seed)
+        splits = contact_splits(fits, space, singles(contact), contact, seed)
         smallest.append(min(s.p_value for s in splits))
     # Uniform p-values: three standard errors of 300 draws around each level.
     for level in (SPLIT_LEVEL, 0.2, 0.5):
@@ -144,3 +149,18 @@ def test_one_cluster_is_seldom_taken_for_two() -> None:
     p_values = np.array([two_cluster_p(rng.normal(size=12), rng, draws=199) for _ in range(200)])
     assert np.mean(p_values < 0.05) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 200)
     assert 0.3 < np.mean(p_values < 0.5) < 0.7
+
+
+def test_recordings_shared_by_subsets_raise_no_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits of subsets that share recordings agree for that reason, not for contact."""
+    monkeypatch.setattr(bounds, "PERMUTATIONS", 199)
+    monkeypatch.setattr(bounds, "two_cluster_p", lambda *_: 1.0)
+    rng = np.random.default_rng(10)
+    ground = [True] * 4 + [False] * 9
+    alarms = 0
+    for seed in range(200):
+        subsets = draw_subsets(13, 30, 0.15, seed)
+        optima = SPACE.nominal + rng.normal(0, [0.5, 0.1, 0.05], (13, 3))
+        fits = np.array([optima[list(subset)].mean(axis=0) for subset in subsets])
+        alarms += any(s.split for s in contact_splits(fits, SPACE, subsets, ground, seed))
+    assert alarms / 200 <= SPLIT_LEVEL + 3 * np.sqrt(SPLIT_LEVEL * (1 - SPLIT_LEVEL) / 200)

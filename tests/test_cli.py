@@ -197,6 +197,7 @@ def test_replay_without_bounds_takes_those_of_the_robot(
     bench_recordings: Path, identified: Path, tmp_path: Path
 ) -> None:
     robot = shutil.copytree(RobotDescription.load("servo_bench").folder, tmp_path / "robot")
+    (robot / "identified.json").unlink(missing_ok=True)
     command = ("replay", bench_recordings, "--robot", robot, "--out", tmp_path / "out", "--json")
     assert pup(*command).json()["model"] == str(robot / "robot.toml")
     shutil.copy(identified / "bounds.json", robot / "identified.json")
@@ -259,7 +260,8 @@ def test_shows_tables_where_no_json_is_asked_for(
     assert done.code == 0
     for words in ("torque_limit", "identified", " rad after", f"report: {out}/report.html"):
         assert words in done.out
-    done = pup("replay", bench_recordings, "--robot", "servo_bench", "--out", tmp_path)
+    command = ("replay", bench_recordings, "--robot", "servo_bench", "--out", tmp_path)
+    done = pup(*command, "--bounds", out / "bounds.json")
     for words in ("step_0.1", "RMSE, rad", "all", "nn_pd"):
         assert words in done.out
 

@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 TASK_SECONDS = 0.05
 """A task should last at least this long: Ray's own cost per task is half a millisecond."""
 POLL_SECONDS = 0.5
+RETRIES = 100
+"""Lost workers and nodes that a task or an actor outlives; one that kills its own stops here."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ class RayRunner:
                     digest = fit.problem.digest
                     # Absolute: an actor's working directory is that of its node's Ray.
                     path = str((checkpoints / f"{fit.name}.npz").absolute())
-                    actor = FitActor.remote()  # type: ignore[attr-defined]
+                    actor = FitActor.remote(_share(len(fits)))  # type: ignore[attr-defined]
                     run = actor.run.remote([references[digest]], digest, fit.settings, path)
                     running[run] = (i, actor)
                 for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
@@ -146,13 +148,16 @@ def _result(reference: Any) -> FitResult:
     try:
         return ray.get(reference)
     except RayTaskError as error:
-        raise error.cause from error
+        cause: BaseException = error
+        while isinstance(cause, RayTaskError) and cause.cause is not None:
+            cause = cause.cause  # what a task raised comes wrapped once more by the actor
+        raise cause from error
 
 
 def _poll(running: Iterable[tuple[int, Any]], fits: Sequence[Fit], statuses: list[Status]) -> None:
     """Ask the actors how far they are, and tell them their share of the cores."""
     live = list(running)
-    share = max(1, _cores() // max(1, len(live)))
+    share = _share(len(live))
     asked = [(i, actor.status.remote(share)) for i, actor in live]
     if asked:
         answered, _ = ray.wait([a for _, a in asked], num_returns=len(asked), timeout=POLL_SECONDS)
@@ -172,16 +177,21 @@ def _done(fit: Fit, result: FitResult) -> Status:
     return Status(fit.name, generations, generations, result.loss, done=True)
 
 
+def _share(fits: int) -> int:
+    """Cores for each of some fits; rounded up, so that none is without a task."""
+    return max(1, -(-_cores() // max(1, fits)))
+
+
 def _cores() -> int:
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
-@ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1, max_concurrency=2)
+@ray.remote(num_cpus=0, max_restarts=RETRIES, max_task_retries=RETRIES, max_concurrency=2)
 class FitActor:
     """Owns one fit; see the module."""
 
-    def __init__(self) -> None:
-        self.share = 1
+    def __init__(self, share: int) -> None:
+        self.share = share
         self.cost = np.inf  # s per candidate, measured
         self.state = (0, np.inf)
         self.lock = threading.Lock()
@@ -227,15 +237,25 @@ class FitActor:
     def _evaluated(self, what: str, problem: list[Any], digest: str, unit: Array) -> list[Any]:
         """What some candidates evaluate to, in pieces of as many tasks as is worth it."""
         with self.lock:
-            longest = max(1, int(len(unit) * self.cost / TASK_SECONDS)) if self.cost < np.inf else 1
-            parts = min(self.share, longest, len(unit))
-        pieces = np.array_split(unit, parts)
+            share = self.share
+        pieces = np.array_split(unit, cut(len(unit), share, self.cost))
         answers = ray.get([evaluate.remote(what, problem, digest, p) for p in pieces])
         self.cost = sum(seconds for _, seconds in answers) / len(unit)
         return [value for value, _ in answers]
 
 
-@ray.remote(num_cpus=1, max_retries=-1)
+def cut(candidates: int, share: int, cost: float) -> int:
+    """How many tasks candidates are cut into.
+
+    Args:
+      candidates: how many there are, one at least.
+      share: cores for them.
+      cost: of one candidate, s; infinite while it is unknown.
+    """
+    return int(max(1, min(share, candidates, candidates * cost / TASK_SECONDS)))
+
+
+@ray.remote(num_cpus=1, max_retries=RETRIES)
 def evaluate(what: str, problem: list[Any], digest: str, unit: Array) -> tuple[Any, float]:
     """`losses` or `errors` of some candidates, and the seconds they took."""
     begin = time.perf_counter()

@@ -24,8 +24,11 @@ class TorqueLaw(Protocol):
     A law may keep state per simulation; it is made anew for every replay.
     """
 
-    armature: Array
-    """Rotor inertia at the joint, shape (n_simulations, n_joints) or broadcastable, kg m²."""
+    armature: Array | None
+    """Rotor inertia at the joint, broadcastable to (n_simulations, n_joints), kg m²; None keeps
+    the model's."""
+    passive: float
+    """Viscous damping that stays when the torque is off, N m s/rad."""
 
     def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
         """Torque of one sub-step.
@@ -61,9 +64,8 @@ class PD:
         self.kp = per_joint(robot, candidates, "kp")
         self.kd = per_joint(robot, candidates, "kd")
         self.limit = per_joint(robot, candidates, "tau_max")
-        self.armature = (
-            candidates["armature"][:, None] if "armature" in candidates else np.zeros((1, 1))
-        )
+        self.armature = candidates["armature"][:, None] if "armature" in candidates else None
+        self.passive = 0.0
 
     def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
         """See TorqueLaw."""
@@ -100,7 +102,7 @@ class NetworkPD:
         self.scale = np.stack([rho * (options.kp_scale / 2), sigma * (options.kd_scale / 2)])
         self.limit = candidates["torque_limit"][:, None]
         self.passive = options.passive_damping
-        self.armature = np.full((1, 1), options.armature)
+        self.armature = np.full((1, 1), options.armature) if options.armature else None
         # Room for what every sub-step computes.
         self._hidden = np.empty_like(self.bias)
         self._weighted = np.empty_like(self.w_out)
@@ -127,7 +129,6 @@ class NetworkPD:
         torque, damping = self.gains(error, velocity)
         torque *= error
         _clip(torque, damping, velocity, self.limit[: len(error)])
-        damping += self.passive
         return torque, damping
 
 

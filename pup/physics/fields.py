@@ -53,7 +53,7 @@ def apply_fields(
     model: Model,
     parameters: Candidates,
     setups: Sequence[dict[str, float]],
-    armature: Array,
+    armature: Array | None,
 ) -> Array:
     """Write the model fields of every simulation.
 
@@ -63,7 +63,8 @@ def apply_fields(
       model: its compiled model.
       parameters: one row per simulation.
       setups: the knobs of each recording; the simulations stand recording by recording.
-      armature: rotor inertia, broadcastable to (n_simulations, n_joints), kg m².
+      armature: rotor inertia, broadcastable to (n_simulations, n_joints), kg m²; None keeps the
+        model's.
 
     Returns:
       Viscous damping outside the servo, shape (n_simulations, n_joints), N m s/rad.
@@ -79,7 +80,7 @@ def apply_fields(
             column = ... if edit.index is None else (..., edit.index)
             field[column] = edit.scale * values + edit.offset
     viscous = np.tile(model.compiled.dof_damping[model.dofs], (len(parameters), 1))
-    if np.any(armature):
+    if armature is not None:
         writer.field("dof_armature")[:, model.dofs] = armature
     for name in parameters.space.names:
         _apply(writer, robot, model, name, parameters[name], viscous)

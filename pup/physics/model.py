@@ -122,6 +122,9 @@ def starting_qpos(
         quaternion = _feet_flat(robot, model.compiled, data)
     else:
         quaternion = _from_roll_pitch(roll, pitch)
+        if robot.imu_site is not None:
+            mount = model.compiled.site(robot.imu_site).quat
+            mujoco.mju_mulQuat(quaternion, quaternion.copy(), mount * (1, -1, -1, -1))
     data.qpos[3:7] = quaternion
     mujoco.mj_kinematics(model.compiled, data)
     data.qpos[2] -= _lowest_point(model.compiled, data)

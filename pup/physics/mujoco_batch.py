@@ -205,6 +205,7 @@ class _Run:
         self.viscous = apply_fields(
             self.batch, robot, group.model, per_simulation, group.setups, self.law.armature
         )
+        self.viscous += self.law.passive
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qpos[:] = np.repeat(group.start, self.candidates, axis=0)
         self.qvel[:, group.model.dofs] = np.repeat(group.start_velocity, self.candidates, axis=0)

@@ -60,12 +60,12 @@ def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Sc
     grid = np.arange(step[-1] + 2) * timestep
     target = _held(recording.target[:, order])
     power = _held(recording.extras.get("torque_enabled", np.ones(len(elapsed)))[:, None])
-    velocity = np.array([_first(recording.extras.get(f"velocity/{name}")) for name in joints])
+    speeds = [recording.extras.get(f"velocity/{name}", np.zeros(1))[0] for name in joints]
     return Schedule(
         target=_mean_over_steps(elapsed, target, grid),
         power=_mean_over_steps(elapsed, power, grid)[:, 0],
-        start=np.array([_first(recording.position[:, i]) for i in order]),
-        start_velocity=velocity,
+        start=_start(recording.position[:, order], target),
+        start_velocity=np.nan_to_num(np.array(speeds)),
         tick_step=step,
         tick_fraction=np.clip(where - step - 1e-9, 0.0, 1.0),
     )
@@ -80,11 +80,19 @@ def _held(values: Array) -> Array:
     return np.asarray(np.take_along_axis(values, np.maximum(rows, first), axis=0))
 
 
-def _first(values: Array | None) -> float:
-    """The first known value of a column, 0 where there is none."""
-    if values is None or np.isnan(values).all():
-        return 0.0
-    return float(values[np.argmax(~np.isnan(values))])
+def _start(position: Array, target: Array) -> Array:
+    """First positions, shape (n_joints,).
+
+    Where the first reading is missing, the next one counts as long as no target has changed
+    before it; else the joint stood at its first target.
+    """
+    read = np.argmax(~np.isnan(position), axis=0)
+    joints = np.arange(position.shape[1])
+    moved = np.argmax(
+        np.append(target != target[0], np.ones((1, len(joints)), bool), axis=0), axis=0
+    )
+    known = ~np.isnan(position[read, joints]) & (read <= moved)
+    return np.asarray(np.where(known, position[read, joints], target[0]))
 
 
 def _mean_over_steps(time: Array, held: Array, grid: Array) -> Array:

@@ -54,9 +54,10 @@ class Split:
       name: the parameter.
       with_contact: its values in the subsets with contact, physical.
       without: its values in those without.
-      separation: difference of the two means over the pooled standard deviation.
-      p_value: of the difference, by permuting the labels and corrected for the number of
-        parameters looked at (family-wise, largest statistic); NaN when a side has under two fits.
+      separation: difference of the two means over its standard error.
+      p_value: of the difference, by permuting which recordings touch the ground and corrected for
+        the number of parameters looked at (family-wise, largest statistic); NaN when a side has
+        under two fits.
       two_clusters: p-value of the values being one cluster against two, labels unseen.
     """
 
@@ -74,21 +75,30 @@ class Split:
 
 
 def contact_splits(
-    fits: Array, space: ParameterSpace, contact: Sequence[bool], seed: int = 0
+    fits: Array,
+    space: ParameterSpace,
+    subsets: Sequence[Sequence[int]],
+    ground: Sequence[bool],
+    seed: int = 0,
 ) -> list[Split]:
     """Test each parameter for a split between subsets with and without contact.
 
     The paper saw one in the torque limit and took it for a sign of missing physics (section V-E).
+    Subsets share recordings, so their fits are not independent; what is exchangeable without an
+    effect of contact is which recordings are those on the ground, and that is what is permuted.
 
     Args:
       fits: physical values, shape (n_subsets, n_parameters); NaN where a subset cannot see a
         parameter.
       space: their space.
-      contact: whether each subset contains a recording on the ground.
+      subsets: the recordings of each subset, by index.
+      ground: whether each recording is on the ground.
       seed: of the permutations.
     """
     unit = space.normalise(fits)
-    label = np.asarray(contact, dtype=bool)
+    touching = np.asarray(ground, dtype=bool)
+    member = np.array([np.isin(np.arange(len(touching)), subset) for subset in subsets])
+    label = _contact(member, touching)
     rng = np.random.default_rng(seed)
     seen = ~np.isnan(unit)
     testable = (seen[label].sum(axis=0) >= 2) & (seen[~label].sum(axis=0) >= 2)
@@ -96,8 +106,8 @@ def contact_splits(
     if testable.any():
         tested = unit[:, testable]
         observed[testable] = _separation(tested, label)
-        shuffled = (rng.permutation(label) for _ in range(PERMUTATIONS))
-        largest = np.array([np.nanmax(np.abs(_separation(tested, s))) for s in shuffled])
+        shuffled = (_contact(member, rng.permutation(touching)) for _ in range(PERMUTATIONS))
+        largest = np.array([np.abs(_separation(tested, s)).max(initial=0) for s in shuffled])
         beyond = largest[:, None] >= np.abs(observed[testable]) - 1e-12
         p_values[testable] = (1 + beyond.sum(axis=0)) / (1 + PERMUTATIONS)
     return [
@@ -113,23 +123,27 @@ def contact_splits(
     ]
 
 
-def _separation(unit: Array, label: NDArray[np.bool_]) -> Array:
-    """Difference of the two means over the pooled standard deviation, per parameter.
+def _contact(member: NDArray[np.bool_], ground: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which subsets (rows of `member`) contain a recording on the ground."""
+    return np.asarray((member & ground).any(axis=1))
 
-    NaN where one side has no value.
+
+def _separation(unit: Array, label: NDArray[np.bool_]) -> Array:
+    """Difference of the two means over its standard error (Welch), per parameter.
+
+    0 where a side has fewer than two values.
     """
     values = np.where(np.isnan(unit), 0.0, unit)
     known = ~np.isnan(unit)
     sides = []
     for side in (label, ~label):
         n = known[side].sum(axis=0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = values[side].sum(axis=0) / n
-        squares = (known[side] * (values[side] - np.nan_to_num(mean)) ** 2).sum(axis=0)
-        sides.append((mean, squares))
-    (a, within_a), (b, within_b) = sides
-    pooled = np.sqrt((within_a + within_b) / known.sum(axis=0))
-    return np.asarray((a - b) / np.maximum(pooled, 1e-3))
+        mean = values[side].sum(axis=0) / np.maximum(n, 1)
+        squares = (known[side] * (values[side] - mean) ** 2).sum(axis=0)
+        sides.append((n, mean, squares / np.maximum(n * (n - 1), 1)))
+    (n_a, a, error_a), (n_b, b, error_b) = sides
+    separation = (a - b) / np.maximum(np.sqrt(error_a + error_b), 1e-3)
+    return np.where((n_a >= 2) & (n_b >= 2), separation, 0.0)
 
 
 def two_cluster_p(values: Array, rng: np.random.Generator, draws: int = 2000) -> float:

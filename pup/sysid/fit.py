@@ -115,6 +115,7 @@ class CmaFit:
         self._history: list[float] = []
         self._told: list[Array] = []
         self.polished: Array | None = None
+        self.longer = False  # whether its checkpoint holds more generations than are asked for
 
     @property
     def generation(self) -> int:
@@ -191,6 +192,7 @@ class CmaFit:
         for generation in losses[: self.settings.generations]:
             self.ask()
             self.tell(generation)
+        self.longer = len(losses) > self.settings.generations
         if len(losses) == self.settings.generations:
             self.polished = polished
 
@@ -226,7 +228,7 @@ def run_fit(
         if polish is not None:
             if fit.polished is None:
                 fit.polished = polish(fit.result.best)
-                if checkpoint is not None:
+                if checkpoint is not None and not fit.longer:
                     fit.save(checkpoint)
             fit.consider(fit.polished, float(evaluate(fit.polished[None])[0]))
         # The first mean itself is never a candidate; a short search may not have found its like.

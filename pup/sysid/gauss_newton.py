@@ -115,7 +115,7 @@ def least_squares(
         if costs[pick] < cost:
             at, value, cost = trials[pick], values[pick], costs[pick]
         if cost < enough:
-            damping = float(np.clip(damping * factors[pick], 1e-6, 1e6))
+            damping = float(np.clip(damping * factors[pick], 1e-4, 1e6))
         elif width + 1 < len(steps):
             width, damping = width + 1, FIRST_DAMPING
         else:
@@ -165,7 +165,7 @@ def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, prio
     normal = jacobian.T @ jacobian + np.diag(prior.weight**2)
     gradient = jacobian.T @ value + prior.weight**2 * (at - prior.mean)
     scale = np.diag(normal)
-    scale = np.maximum(scale, 1e-12 * scale.max() or 1.0)
+    scale = np.maximum(scale, 1e-6 * scale.max() or 1.0)
     systems = normal + dampings[:, None, None] * np.diag(scale)
     return np.array([_step_within(system, gradient, at) for system in systems])
 

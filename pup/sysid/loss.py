@@ -96,11 +96,11 @@ class ReplayLoss:
         """Equation 1 over all recordings or a subset of them, shape (n_candidates,)."""
         chosen = np.arange(len(self.recordings)) if subset is None else np.asarray(subset)
         tilting, standing = chosen[self.tilting[chosen]], chosen[self.standing[chosen]]
-        loss = terms.position[:, chosen].mean(axis=1)
+        loss = _mean(terms.position[:, chosen])
         if len(tilting):
-            loss = loss + TILT_WEIGHT * terms.tilt[:, tilting].mean(axis=1)
+            loss = loss + TILT_WEIGHT * _mean(terms.tilt[:, tilting])
         if len(standing):
-            loss = loss + FEET_WEIGHT * terms.feet[:, standing].mean(axis=1)
+            loss = loss + FEET_WEIGHT * _mean(terms.feet[:, standing])
         return np.asarray(loss)
 
     def omitted(self) -> list[str]:
@@ -185,3 +185,8 @@ def _difference(simulated: Array, measured: Array, lost: float) -> Array:
 def _length(error: Array) -> Array:
     """Euclidean norm over the last axis; what was not measured counts zero."""
     return np.asarray(np.sqrt(np.nansum(error**2, axis=-1)))
+
+
+def _mean(values: Array) -> Array:
+    """Mean of each row; in memory order, so that it does not depend on the number of rows."""
+    return np.asarray(np.ascontiguousarray(values).mean(axis=1))

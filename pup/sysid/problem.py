@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,13 @@ from pup.physics.parameters import ParameterSpace
 from pup.physics.simulator import Trajectories
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
-from pup.sysid.loss import TILT_WEIGHT, ReplayLoss
+from pup.sysid.loss import ReplayLoss
 
 Array = NDArray[np.float64]
+
+MODEL = 1
+"""Raised with every change of the physics or the loss, which makes old checkpoints another's."""
+_VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "nevergrad", "cma")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ class Problem:
     @cached_property
     def digest(self) -> str:
         """Identifies what is evaluated, however many threads do it."""
-        parts = [self.robot.digest, self.actuator, *self.free, *self.space.names]
+        parts = [self.robot.digest, self.actuator, *self.free, *self.space.names, *_VERSIONS]
         parts += [
             repr(a.tolist()) for a in (self.space.nominal, self.space.lower, self.space.upper)
         ]
@@ -88,15 +93,3 @@ class Problem:
     def errors(self, unit: Array) -> tuple[Array, NDArray[np.int64]]:
         """Weighted errors of candidates (n, n_free) and their blocks, see ReplayLoss."""
         return self.loss.weighted_errors(self.replay(unit))
-
-    def residuals(self, unit: Array) -> Array:
-        """Position and tilt errors of candidates (n, n_free), shape (n, n_residuals).
-
-        The tilt has its weight in equation 1; a value that was not measured counts zero, one of a
-        broken simulation as in the loss.
-        """
-        trajectories = self.replay(unit)
-        position, tilt = self.loss.errors(trajectories)
-        return np.concatenate(
-            [position.reshape(len(unit), -1), TILT_WEIGHT * tilt.reshape(len(unit), -1)], axis=1
-        )

@@ -1,0 +1,292 @@
+"""Whatever a job is stopped by, the same command finishes it with the same result.
+
+Each test runs `pup presysid` as a user does, ends it somehow, and looks at what is left: on the
+disk, among the processes, on the screen.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from ray.cluster_utils import Cluster
+
+from workers import reaper
+
+pytestmark = pytest.mark.ray
+BUDGET = (
+    *("--actuator", "pd", "--no-comparison", "--population", 8, "--generations", 30),
+    *("--subsets", 3, "--subset-generations", 10, "--cores", 2),
+)
+STOPPED = "pup presysid: stopped; the same command resumes\n"
+PATIENCE = 120.0  # s; a busy machine takes its time
+
+
+def until(true: Callable[[], Any], patience: float = PATIENCE) -> None:
+    deadline = time.monotonic() + patience
+    while not true():
+        assert time.monotonic() < deadline, "this should not take so long"
+        time.sleep(0.02)
+
+
+class Job:
+    """A running `pup presysid` in a process group of its own, as a shell has it."""
+
+    def __init__(self, recordings: Path, out: Path, *more: object) -> None:
+        self.out = out
+        command = ("presysid", recordings, "--robot", "darwin_leg", "--out", out, *BUDGET, *more)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "services.cli", *map(str, command), "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.ray: str | None = None
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def started_ray(self) -> str | None:
+        """The folder of the job's embedded Ray, once there is one."""
+        if self.ray is None:
+            for child in psutil.Process(self.pid).children():
+                command = _command(child)
+                if "workers.reaper" in command:
+                    self.ray = command[-2]
+        return self.ray
+
+    def come_to(self, moment: str) -> None:
+        """Wait for a moment of the job: a file below its folder, or the start of its Ray."""
+        if moment == "ray":
+            until(lambda: self.process.poll() is not None or self.started_ray())
+        else:
+            until(lambda: self.process.poll() is not None or list(self.out.glob(moment)))
+        assert self.process.poll() is None, self.process.communicate()
+        self.started_ray()
+
+    def end(self) -> tuple[int, str, str]:
+        """Wait for its end: the exit code, standard output and standard error."""
+        out, err = self.process.communicate(timeout=PATIENCE)
+        return self.process.returncode, out, err
+
+    def left(self) -> list[str]:
+        """Processes of its Ray, and its Ray's folder."""
+        if self.ray is None:
+            return []
+        mark = f"{reaper.SESSION}={self.ray}"
+        found = [self.ray] if Path(self.ray).exists() else []
+        for process in psutil.process_iter():
+            try:
+                environment = [f"{k}={v}" for k, v in process.environ().items()]
+            except psutil.Error:
+                environment = []
+            if mark in environment or any(self.ray in word for word in _command(process)):
+                found.append(f"{process.pid} {' '.join(_command(process))[:100]}")
+        return found
+
+    def assert_nothing_left(self) -> None:
+        deadline = time.monotonic() + 10
+        while left := self.left():
+            assert time.monotonic() < deadline, left
+            time.sleep(0.1)
+
+
+def _command(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
+
+
+def document(out: Path) -> Any:
+    """What the job found, but for the time it took."""
+    found = json.loads((out / "bounds.json").read_text())
+    del found["provenance"]["seconds"]
+    return found
+
+
+def assert_progress_alone(err: str) -> None:
+    for line in err.splitlines():
+        assert line.startswith(("nominal fits: ", "subset fits: ")), line
+
+
+@pytest.fixture(scope="module")
+def wanted(leg_recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """What an undisturbed run finds, in one process."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    code, _, err = Job(leg_recordings, out, "--local").end()
+    assert code == 0, err
+    assert_progress_alone(err)
+    return document(out)
+
+
+def test_an_undisturbed_run_shows_its_progress_and_cleans_up(
+    leg_recordings: Path, tmp_path: Path, wanted: Any
+) -> None:
+    job = Job(leg_recordings, tmp_path)
+    job.come_to("checkpoints/*.npz")
+    code, out, err = job.end()
+    job.assert_nothing_left()
+    assert code == 0, err
+    assert_progress_alone(err)
+    assert len(out.splitlines()) == 1
+    assert json.loads(out)["presysid"]["robot"] == "darwin_leg"
+    assert document(tmp_path) == wanted
+
+
+@pytest.mark.parametrize("where", ["ray", "local"])
+def test_killed_again_and_again(
+    leg_recordings: Path, tmp_path: Path, wanted: Any, where: str
+) -> None:
+    """SIGKILL leaves no time to clean up: the job's watcher does, and the next run goes on."""
+    rng = random.Random(where)
+    moments = ["checkpoints/*.npz", "checkpoints/subsets-*/*.npz"]
+    if where == "ray":
+        moments.insert(0, "ray")
+    for moment in moments:
+        job = Job(leg_recordings, tmp_path, *(["--local"] if where == "local" else []))
+        job.come_to(moment)
+        time.sleep(rng.uniform(0, 0.5))
+        job.process.kill()
+        assert job.end()[0] in (-signal.SIGKILL, 0)
+        job.assert_nothing_left()
+        assert_checkpoints_whole(tmp_path)
+    last = Job(leg_recordings, tmp_path, *(["--local"] if where == "local" else []))
+    code, _, err = last.end()
+    assert code == 0, err
+    last.assert_nothing_left()
+    assert document(tmp_path) == wanted
+
+
+def assert_checkpoints_whole(out: Path) -> None:
+    for path in out.rglob("*.npz"):
+        if not path.name.startswith("."):
+            with np.load(path) as saved:
+                assert len(saved["losses"]) > 0
+
+
+@pytest.mark.parametrize("where", ["ray", "local"])
+def test_stopped_and_resumed(leg_recordings: Path, tmp_path: Path, wanted: Any, where: str) -> None:
+    """Ctrl-C reaches every process of the group, SIGTERM only the first."""
+    local = ["--local"] if where == "local" else []
+    stops: list[tuple[str, Callable[[Job], None]]] = [
+        ("checkpoints/*.npz", lambda job: os.killpg(job.pid, signal.SIGINT)),
+        ("checkpoints/subsets-*/*.npz", lambda job: job.process.terminate()),
+    ]
+    if where == "ray":
+        stops.insert(0, ("ray", lambda job: job.process.terminate()))
+        stops.insert(1, ("ray", lambda job: os.killpg(job.pid, signal.SIGINT)))
+    for moment, stop in stops:
+        job = Job(leg_recordings, tmp_path, *local)
+        job.come_to(moment)
+        stop(job)
+        code, out, err = job.end()
+        assert code == 130, err
+        assert out == ""
+        assert err.endswith(STOPPED)
+        assert_progress_alone(err.removesuffix(STOPPED))
+        job.assert_nothing_left()
+    last = Job(leg_recordings, tmp_path, *local)
+    code, _, err = last.end()
+    assert code == 0, err
+    assert document(tmp_path) == wanted
+
+
+def test_sigterm_is_heard_in_the_background(leg_recordings: Path, tmp_path: Path) -> None:
+    """A shell's background jobs ignore SIGINT; SIGTERM must still end them."""
+    script = (
+        f"{sys.executable} -m services.cli presysid {leg_recordings} --robot darwin_leg --local "
+        f"--out {tmp_path} --generations 100000 & echo $!; wait $!; echo $?"
+    )
+    shell = subprocess.Popen(["sh", "-c", script], stdout=subprocess.PIPE, text=True)
+    assert shell.stdout is not None
+    pid = int(shell.stdout.readline())
+    until(lambda: list(tmp_path.glob("checkpoints/*.npz")))
+    os.kill(pid, signal.SIGTERM)
+    assert shell.stdout.readline() == "130\n"
+    shell.wait()
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    """A head without cores and two nodes with one each, all on this machine."""
+    folder = mkdtemp(prefix="pup-test-")  # a short path: sockets lie below it
+    store = {"object_store_memory": 80 * 2**20, "include_dashboard": False}
+    made = Cluster(
+        initialize_head=True,
+        head_node_args={
+            "num_cpus": 0,
+            "temp_dir": folder,
+            "_system_config": {
+                "health_check_initial_delay_ms": 0,
+                "health_check_period_ms": 1000,
+                "health_check_failure_threshold": 3,
+            },
+            **store,
+        },
+    )
+    try:
+        made.workers = [made.add_node(num_cpus=1, **store) for _ in range(2)]
+        yield made
+    finally:
+        made.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def test_a_lost_node_changes_nothing(
+    leg_recordings: Path, tmp_path: Path, wanted: Any, cluster: Any
+) -> None:
+    job = Job(leg_recordings, tmp_path, "--address", cluster.address)
+    job.come_to("checkpoints/*.npz")
+    cluster.remove_node(cluster.workers[0], allow_graceful=False)
+    code, out, err = job.end()
+    assert code == 0, err
+    assert job.started_ray() is None
+    assert len(out.splitlines()) == 1
+    assert document(tmp_path) == wanted
+    # And a job that is stopped takes all of its own with it.
+    again = Job(leg_recordings, tmp_path / "again", "--address", cluster.address)
+    again.come_to("checkpoints/*.npz")
+    os.killpg(again.pid, signal.SIGINT)
+    code, _, err = again.end()
+    assert code == 130
+    assert err.endswith(STOPPED)
+    until(lambda: not {"ray::FitActor", "ray::evaluate"} & set(_children()), 30)
+
+
+def _children() -> list[str]:
+    """Titles of all processes below this one; the cluster's are."""
+    names = []
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):
+            names.append(process.name())
+    return names
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_no_cluster_at_the_address(leg_recordings: Path, tmp_path: Path, scheme: str) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"{scheme}127.0.0.1:{free.getsockname()[1]}"
+        begin = time.monotonic()
+        code, out, err = Job(leg_recordings, tmp_path, "--address", address).end()
+    assert code == 2
+    assert out == ""
+    (line,) = err.splitlines()
+    assert address in line and "no Ray cluster answers" in line
+    assert time.monotonic() - begin < 60
