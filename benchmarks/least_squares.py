@@ -88,7 +88,9 @@ def main() -> None:
     ]
     to_same = ratio([a for a, _ in reached], [b for _, b in reached])
     to_end = ratio([a.seconds for a, _ in pairs], [b.seconds for _, b in pairs])
-    losses = ratio(*([_loss(problem, run.point) for run in side] for side in zip(*pairs)))
+    losses = ratio(
+        [_loss(problem, a.point) for a, _ in pairs], [_loss(problem, b.point) for _, b in pairs]
+    )
     report.say("ours over mujoco.sysid, median (range) of pairs:")
     report.say(f"  time to the same loss {to_same}; bar 0.33")
     report.say(f"  time to the end of the fit {to_end}")
@@ -162,8 +164,12 @@ class _Rollouts:
         held = [np.minimum(np.arange(longest), plan.steps - 1) for plan in plans]
         self.control = np.stack([p.target[rows] for p, rows in zip(plans, held, strict=True)])
         model = compile_model(robot, "suspended")
-        qpos = [starting_qpos(robot, model, p.start, r) for p, r in zip(plans, recordings)]
-        self.start = np.stack([sysid.create_initial_state(self.base, q) for q in qpos])
+        self.start = np.stack(
+            [
+                sysid.create_initial_state(self.base, starting_qpos(robot, model, plan.start, r))
+                for plan, r in zip(plans, recordings, strict=True)
+            ]
+        )
         self.run = np.repeat(np.arange(len(plans)), [len(p.tick_step) for p in plans])
         self.step = np.concatenate([p.tick_step for p in plans])
         self.share = np.concatenate([p.tick_fraction for p in plans])[:, None]
