@@ -208,7 +208,7 @@ class _Rollouts:
         q = q.reshape(len(unit), runs, *q.shape[1:])
         before, after = q[:, self.run, self.step], q[:, self.run, self.step + 1]
         error = before + self.share * (after - before) - self.measured
-        return np.nan_to_num(error).reshape(len(unit), -1)
+        return np.asarray(np.nan_to_num(error).reshape(len(unit), -1))
 
     def _model(self, values: Array) -> mujoco.MjModel:
         model = copy.copy(self.base)

@@ -34,7 +34,7 @@ SPRING, DAMPER = 15.0, 1.0  # N m/rad, N m s/rad
 
 
 def main() -> None:
-    options = parser(__doc__, rounds=11)
+    options = parser(__doc__, rounds=7)
     options.add_argument("--largest", type=int, default=SIZES[-1], help="largest batch of part two")
     given = options.parse_args()
     report = Report("replay", given.json)
@@ -50,7 +50,7 @@ def main() -> None:
     report.add("against_engine", against)
     sizes = [size for size in SIZES if size <= given.largest]
     report.say("suspended steps, NN-PD: milliseconds per candidate; bar: all within 25 % of mean")
-    scaling = _scaling(robot, sizes, given.threads, max(1, given.rounds // 4), report)
+    scaling = _scaling(robot, sizes, given.threads, max(1, given.rounds // 3), report)
     report.add("scaling", scaling)
     report.finish()
 
@@ -119,7 +119,7 @@ def _bare_informed(
 
         def __init__(self, robot: RobotDescription, candidates: Candidates) -> None:
             self.law = inner(robot, candidates)
-            self.armature = self.law.armature
+            self.armature, self.passive = self.law.armature, self.law.passive
 
         def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
             torque, damping = self.law.torque(error, velocity)
@@ -131,8 +131,12 @@ def _bare_informed(
     alone.replay(candidates)
     per_simulation = scaled(robot, candidates, group.setups)
     batch = mujoco.batch.Batch(group.model.compiled, len(per_simulation), simulator.threads)
-    armature = inner(robot, per_simulation).armature
-    apply_fields(batch, robot, group.model, per_simulation, group.setups, armature)
+    law = inner(robot, per_simulation)
+    viscous = law.passive + apply_fields(
+        batch, robot, group.model, per_simulation, group.setups, law.armature
+    )
+    for torque, damping in torques:
+        damping += viscous[: len(torque)]
     batch.qpos[:] = np.repeat(group.start, len(candidates), axis=0)
     force, damper = batch.bind("qfrc_applied"), batch.expand("dof_damping")
     state, ids = batch.state.copy(), np.arange(len(per_simulation), dtype=np.int32)

@@ -26,7 +26,7 @@ from ray.cluster_utils import Cluster
 
 from workers import reaper
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.slow]  # each kills and resumes whole command lines
 BUDGET = (
     *("--actuator", "pd", "--no-comparison", "--population", 8, "--generations", 30),
     *("--subsets", 3, "--subset-generations", 10, "--cores", 2),

@@ -45,9 +45,10 @@ def wanted(fits: list[Fit], tmp_path_factory: pytest.TempPathFactory) -> list[Fi
 
 
 @pytest.fixture(scope="module")
-def embedded() -> Iterator[None]:
+def runner() -> Iterator[RayRunner]:
+    """One for all tests: its actors stay, as from stage to stage of a job."""
     with connected(cores=2):
-        yield
+        yield RayRunner()
 
 
 def assert_same(results: Sequence[FitResult], wanted: Sequence[FitResult]) -> None:
@@ -85,10 +86,10 @@ def kill_one(name: str) -> None:
 
 
 def test_the_same_as_in_one_process(
-    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
+    runner: RayRunner, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
 ) -> None:
     told = Once(1, lambda: None)
-    assert_same(RayRunner().run(fits, tmp_path, told), wanted)
+    assert_same(runner.run(fits, tmp_path, told), wanted)
     assert [s.name for s in told.seen[-1]] == ["all", "few", "near"]
     assert all(s.done and s.generation == GENERATIONS for s in told.seen[-1])
     for before, after in zip(told.seen, told.seen[1:], strict=False):
@@ -97,18 +98,18 @@ def test_the_same_as_in_one_process(
 
 
 def test_a_finished_fit_is_not_fitted_again(
-    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
+    runner: RayRunner, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
 ) -> None:
     """Checkpoints of one runner are good for the other."""
     LocalRunner().run(fits, tmp_path, lambda _: None)
     written = {f: f.stat().st_mtime_ns for f in tmp_path.iterdir()}
-    assert_same(RayRunner().run(fits, tmp_path, lambda _: None), wanted)
+    assert_same(runner.run(fits, tmp_path, lambda _: None), wanted)
     assert written == {f: f.stat().st_mtime_ns for f in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize("share", [1, 3, 8, 100])
 def test_the_number_of_tasks_changes_nothing(
-    embedded: None,
+    runner: RayRunner,
     fits: list[Fit],
     wanted: list[FitResult],
     tmp_path: Path,
@@ -118,33 +119,33 @@ def test_the_number_of_tasks_changes_nothing(
     """A generation cut for any number of cores, down to single candidates."""
     monkeypatch.setattr(module, "_cores", lambda: share)
     monkeypatch.setattr(module, "POLL_SECONDS", 0.02)
-    assert_same(RayRunner().run(fits[1:2], tmp_path, lambda _: None), wanted[1:2])
+    assert_same(runner.run(fits[1:2], tmp_path, lambda _: None), wanted[1:2])
 
 
 @pytest.mark.parametrize("generation", [1, 10])
 def test_a_killed_worker_changes_nothing(
-    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path, generation: int
+    runner: RayRunner, fits: list[Fit], wanted: list[FitResult], tmp_path: Path, generation: int
 ) -> None:
     kill = Once(generation, lambda: kill_one("ray::evaluate"))
-    assert_same(RayRunner().run(fits, tmp_path, kill), wanted)
+    assert_same(runner.run(fits, tmp_path, kill), wanted)
     assert kill.done
 
 
 @pytest.mark.parametrize("generation", [1, 10])
 def test_a_killed_actor_resumes_from_its_checkpoint(
-    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path, generation: int
+    runner: RayRunner, fits: list[Fit], wanted: list[FitResult], tmp_path: Path, generation: int
 ) -> None:
     kill = Once(generation, lambda: kill_one("ray::FitActor"))
-    assert_same(RayRunner().run(fits, tmp_path, kill), wanted)
+    assert_same(runner.run(fits, tmp_path, kill), wanted)
     assert kill.done
 
 
 def test_what_is_wrong_with_an_input_is_told_as_such(
-    embedded: None, fits: list[Fit], tmp_path: Path
+    runner: RayRunner, fits: list[Fit], tmp_path: Path
 ) -> None:
     (tmp_path / "few.npz").write_bytes(b"torn")
     with pytest.raises(InputError, match=r"few\.npz: not a checkpoint"):
-        RayRunner().run(fits, tmp_path, lambda _: None)
+        runner.run(fits, tmp_path, lambda _: None)
     deadline = time.monotonic() + 20
     while workers_named("ray::FitActor"):  # those of the other fits are gone too
         assert time.monotonic() < deadline
@@ -152,24 +153,24 @@ def test_what_is_wrong_with_an_input_is_told_as_such(
 
 
 def test_a_stopped_runner_leaves_nothing_running_and_resumes(
-    embedded: None, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
+    runner: RayRunner, fits: list[Fit], wanted: list[FitResult], tmp_path: Path
 ) -> None:
     def stop() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        RayRunner().run(fits, tmp_path, Once(5, stop))
+        runner.run(fits, tmp_path, Once(5, stop))
     deadline = time.monotonic() + 20
     while workers_named("ray::FitActor") or workers_named("ray::evaluate"):
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    assert_same(RayRunner().run(fits, tmp_path, lambda _: None), wanted)
+    assert_same(runner.run(fits, tmp_path, lambda _: None), wanted)
 
 
-def test_more_fits_than_run_at_once(embedded: None, fits: list[Fit], tmp_path: Path) -> None:
+def test_more_fits_than_run_at_once(runner: RayRunner, fits: list[Fit], tmp_path: Path) -> None:
     many = [
         Fit(f"f{i}", fits[1].problem, replace(fits[1].settings, generations=2, seed=i))
         for i in range(7)
     ]
     local = LocalRunner().run(many, tmp_path / "local", lambda _: None)
-    assert_same(RayRunner().run(many, tmp_path / "ray", lambda _: None), local)
+    assert_same(runner.run(many, tmp_path / "ray", lambda _: None), local)

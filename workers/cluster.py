@@ -1,4 +1,10 @@
-"""The Ray that a job runs on: a cluster that is there, or one embedded in this process."""
+"""The Ray that a job runs on: a cluster that is there, or one embedded in this process.
+
+When an actor dies while tasks of its own run, Ray 2.60 counts those tasks as running for ever
+(ray issue 64627), and with its cap on workers a node soon starts none but one every few seconds.
+The cap is for tasks that wait for other tasks, which ours do not: an embedded Ray is without it,
+and the nodes of a cluster are best started with RAY_worker_cap_enabled=0 in their environment.
+"""
 
 import os
 import signal
@@ -88,6 +94,7 @@ def _embedded(cores: int | None) -> Iterator[None]:
                 log_to_driver=False,
                 logging_level="ERROR",
                 object_store_memory=OBJECT_STORE,
+                _system_config={"worker_cap_enabled": False},  # see the module
                 _temp_dir=folder,
                 _node_ip_address="127.0.0.1",
             )

@@ -110,8 +110,12 @@ class LocalRunner:
 class RayRunner:
     """Runs fits at once on the Ray cluster this process is connected to.
 
-    Checkpoints must lie where every node can write.
+    Checkpoints must lie where every node can write. Actors are kept for later fits, as a new one
+    spends seconds on its imports.
     """
+
+    def __init__(self) -> None:
+        self._idle: list[Any] = []
 
     def run(self, fits: Sequence[Fit], checkpoints: Path, progress: Progress) -> list[FitResult]:
         """See Runner."""
@@ -128,12 +132,16 @@ class RayRunner:
                     digest = fit.problem.digest
                     # Absolute: an actor's working directory is that of its node's Ray.
                     path = str((checkpoints / f"{fit.name}.npz").absolute())
-                    actor = FitActor.remote(_share(len(fits)))  # type: ignore[attr-defined]
-                    run = actor.run.remote([references[digest]], digest, fit.settings, path)
+                    actor = self._idle.pop() if self._idle else _actor()
+                    share = _share(len(fits))
+                    run = actor.run.remote(
+                        fit.name, [references[digest]], digest, fit.settings, path, share
+                    )
                     running[run] = (i, actor)
                 for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
-                    i, _ = running.pop(reference)  # its actor ends with its last reference
+                    i, actor = running.pop(reference)
                     results[i] = _result(reference)
+                    self._idle.append(actor)
                     statuses[i] = _done(fits[i], results[i])
                 _poll(running.values(), fits, statuses)
                 progress(statuses)
@@ -141,6 +149,10 @@ class RayRunner:
             for _, actor in running.values():
                 ray.kill(actor)
         return [results[i] for i in range(len(fits))]
+
+
+def _actor() -> Any:
+    return FitActor.remote()  # type: ignore[attr-defined]
 
 
 def _result(reference: Any) -> FitResult:
@@ -158,14 +170,15 @@ def _poll(running: Iterable[tuple[int, Any]], fits: Sequence[Fit], statuses: lis
     """Ask the actors how far they are, and tell them their share of the cores."""
     live = list(running)
     share = _share(len(live))
-    asked = [(i, actor.status.remote(share)) for i, actor in live]
+    asked = [(i, actor.status.remote(fits[i].name, share)) for i, actor in live]
     if asked:
         answered, _ = ray.wait([a for _, a in asked], num_returns=len(asked), timeout=POLL_SECONDS)
         for i, answer in asked:
-            # An actor that starts, restarts or has just ended does not answer.
+            # An actor that starts, restarts or has just ended does not answer; one that has
+            # restarted is at its checkpoint only after its next generation.
             with suppress(RayError):
-                if answer in answered:
-                    statuses[i] = _status(fits[i], *ray.get(answer))
+                told = _status(fits[i], *ray.get(answer)) if answer in answered else statuses[i]
+                statuses[i] = max(told, statuses[i], key=lambda s: s.generation)
 
 
 def _status(fit: Fit, generation: int, loss: float) -> Status:
@@ -190,23 +203,34 @@ def _cores() -> int:
 class FitActor:
     """Owns one fit; see the module."""
 
-    def __init__(self, share: int) -> None:
-        self.share = share
+    def __init__(self) -> None:
+        self.name = ""
+        self.share = 1
         self.cost = np.inf  # s per candidate, measured
         self.state = (0, np.inf)
         self.lock = threading.Lock()
 
     def run(
-        self, problem: list[Any], digest: str, settings: FitSettings, checkpoint: str
+        self,
+        name: str,
+        problem: list[Any],
+        digest: str,
+        settings: FitSettings,
+        checkpoint: str,
+        share: int,
     ) -> FitResult:
         """Run a fit to its end.
 
         Args:
+          name: of the fit.
           problem: the problem's reference, in a list so that Ray leaves it a reference.
           digest: of the problem.
           settings: the search.
           checkpoint: path of its checkpoint.
+          share: cores it has to begin with.
         """
+        with self.lock:
+            self.name, self.share, self.cost, self.state = name, share, np.inf, (0, np.inf)
 
         def losses(unit: Array) -> Array:
             return np.concatenate(self._evaluated("losses", problem, digest, unit))
@@ -224,9 +248,14 @@ class FitActor:
             partial(polish, errors, anchor=settings.anchor),
         )
 
-    def status(self, share: int) -> tuple[int, float]:
-        """Generations done and the best objective; takes the number of tasks to cut one into."""
+    def status(self, name: str, share: int) -> tuple[int, float]:
+        """Generations done and the best objective; takes the cores that the fit has now.
+
+        Of a fit that has not begun, or has begun again, there are none yet.
+        """
         with self.lock:
+            if name != self.name:
+                return 0, np.inf
             self.share = share
             return self.state
 
