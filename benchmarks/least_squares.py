@@ -26,7 +26,7 @@ import mujoco.rollout
 import numpy as np
 from mujoco import sysid
 
-from benchmarks.paired import ROBOT, Report, parser, ratio, shipped
+from benchmarks.paired import ROBOT, Cost, Report, parser, ratio, shipped
 from pup.physics.model import compile_model, starting_qpos
 from pup.physics.parameters import robot_space
 from pup.physics.simulator import schedule
@@ -46,16 +46,17 @@ OPTIMISERS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """One fit: where it ended, and the lowest loss among the candidates seen by when (s)."""
+    """One fit: where it ended, and the lowest loss among the candidates seen by when."""
 
     point: Array
-    seconds: float
+    end: Cost
     candidates: int
-    trace: list[tuple[float, float]]
+    trace: list[tuple[Cost, float]]
 
-    def reaches(self, loss: float) -> float:
-        """Seconds to a loss, infinite where it is never reached."""
-        return next((when for when, lowest in self.trace if lowest <= loss), float("inf"))
+    def reaches(self, loss: float) -> Cost:
+        """When it comes to a loss, never where it does not."""
+        never = Cost(float("inf"), float("inf"))
+        return next((when for when, lowest in self.trace if lowest <= loss), never)
 
 
 def main() -> None:
@@ -86,18 +87,19 @@ def main() -> None:
     reached = [
         (a.reaches(goal), b.reaches(goal)) for (a, b), goal in zip(pairs, goals, strict=True)
     ]
-    to_same = ratio([a for a, _ in reached], [b for _, b in reached])
-    to_end = ratio([a.seconds for a, _ in pairs], [b.seconds for _, b in pairs])
+    ended = [(a.end, b.end) for a, b in pairs]
     losses = ratio(
         [_loss(problem, a.point) for a, _ in pairs], [_loss(problem, b.point) for _, b in pairs]
     )
     report.say("ours over mujoco.sysid, median (range) of pairs:")
-    report.say(f"  time to the same loss {to_same}; bar 0.33")
-    report.say(f"  time to the end of the fit {to_end}")
-    report.say(f"  loss at the end {losses}; bar 1.01")
+    for key, costs in (("same_loss", reached), ("end", ended)):
+        wall = ratio([a.wall for a, _ in costs], [b.wall for _, b in costs])
+        processor = ratio([a.processor for a, _ in costs], [b.processor for _, b in costs])
+        to = {"same_loss": "to the same loss (bar 0.33)", "end": "to the end of the fit"}[key]
+        report.say(f"  time {to}: {wall} on the clock, {processor} of the processor")
+        report.add(f"time_to_{key}", {"wall": asdict(wall), "processor": asdict(processor)})
+    report.say(f"  loss at the end (bar 1.01): {losses}")
     report.add("optimiser", best)
-    report.add("time_to_same_loss", asdict(to_same))
-    report.add("time_to_end", asdict(to_end))
     report.add("loss", asdict(losses))
     report.add("runs", [[_row(problem, run) for run in pair] for pair in pairs])
     report.finish()
@@ -125,20 +127,29 @@ class _Trace:
 
     def __init__(self, residuals: Callable[[Array], Array]) -> None:
         self.residuals = residuals
-        self.begin = time.perf_counter()
+        self.begin = _now()
         self.lowest = np.inf
         self.candidates = 0
-        self.points: list[tuple[float, float]] = []
+        self.points: list[tuple[Cost, float]] = []
 
     def __call__(self, unit: Array) -> Array:
         values = self.residuals(unit)
         self.candidates += len(unit)
         self.lowest = min(self.lowest, float((values**2).sum(axis=1).min() / 2))
-        self.points.append((time.perf_counter() - self.begin, self.lowest))
+        self.points.append((self._so_far(), self.lowest))
         return values
 
     def run(self, point: Array) -> Run:
-        return Run(point, time.perf_counter() - self.begin, self.candidates, self.points)
+        """The fit that ended at a point just now."""
+        return Run(point, self._so_far(), self.candidates, self.points)
+
+    def _so_far(self) -> Cost:
+        now = _now()
+        return Cost(now.wall - self.begin.wall, now.processor - self.begin.processor)
+
+
+def _now() -> Cost:
+    return Cost(time.perf_counter(), time.process_time())
 
 
 def _ours(problem: Problem, start: Array) -> Run:
@@ -238,14 +249,14 @@ def _with_servos(robot: RobotDescription) -> mujoco.MjModel:
 def _row(problem: Problem, run: Run) -> dict[str, object]:
     return {
         "loss": _loss(problem, run.point),
-        "seconds": run.seconds,
+        "end": asdict(run.end),
         "candidates": run.candidates,
-        "trace": run.trace,
+        "trace": [(when.wall, when.processor, loss) for when, loss in run.trace],
     }
 
 
 def _told(problem: Problem, run: Run) -> str:
-    return f"{_loss(problem, run.point):.6f} in {run.seconds:.1f} s, {run.candidates} candidates"
+    return f"{_loss(problem, run.point):.6f} in {run.end.wall:.1f} s, {run.candidates} candidates"
 
 
 if __name__ == "__main__":

@@ -223,22 +223,16 @@ def test_sigterm_is_heard_in_the_background(leg_recordings: Path, tmp_path: Path
 
 
 @pytest.fixture
-def cluster() -> Iterator[Any]:
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A head without cores and two nodes with one each, all on this machine."""
-    folder = mkdtemp(prefix="pup-test-")  # a short path: sockets lie below it
+    folder = Path(mkdtemp(prefix="pup-test-"))  # a short path: sockets lie below it
+    (folder / "ray").mkdir()
+    monkeypatch.setenv("RAY_TMPDIR", str(folder))
     store = {"object_store_memory": 80 * 2**20, "include_dashboard": False}
+    quick = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 1000}
+    system = {**quick, "health_check_failure_threshold": 3, "worker_cap_enabled": False}
     made = Cluster(
-        initialize_head=True,
-        head_node_args={
-            "num_cpus": 0,
-            "temp_dir": folder,
-            "_system_config": {
-                "health_check_initial_delay_ms": 0,
-                "health_check_period_ms": 1000,
-                "health_check_failure_threshold": 3,
-            },
-            **store,
-        },
+        initialize_head=True, head_node_args={"num_cpus": 0, "_system_config": system, **store}
     )
     try:
         made.workers = [made.add_node(num_cpus=1, **store) for _ in range(2)]
@@ -256,7 +250,7 @@ def test_a_lost_node_changes_nothing(
     cluster.remove_node(cluster.workers[0], allow_graceful=False)
     code, out, err = job.end()
     assert code == 0, err
-    assert job.started_ray() is None
+    assert job.ray is None
     assert len(out.splitlines()) == 1
     assert document(tmp_path) == wanted
     # And a job that is stopped takes all of its own with it.

@@ -6,6 +6,7 @@ The cap is for tasks that wait for other tasks, which ours do not: an embedded R
 and the nodes of a cluster are best started with RAY_worker_cap_enabled=0 in their environment.
 """
 
+import logging
 import os
 import signal
 import socket
@@ -13,6 +14,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from tempfile import mkdtemp
+from types import FrameType
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -52,7 +54,7 @@ def _joined(address: str) -> Iterator[None]:
     _probe(address)
     try:
         with _own_signals():
-            ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError) as error:
         told = " ".join(str(error).split())[:200]
         raise InputError(f"--address {address}: no Ray cluster answers there ({told})") from error
@@ -92,7 +94,7 @@ def _embedded(cores: int | None) -> Iterator[None]:
                 num_cpus=cores,
                 include_dashboard=False,
                 log_to_driver=False,
-                logging_level="ERROR",
+                logging_level=logging.ERROR,
                 object_store_memory=OBJECT_STORE,
                 _system_config={"worker_cap_enabled": False},  # see the module
                 _temp_dir=folder,
@@ -128,19 +130,32 @@ def _messages() -> Iterator[None]:
 
 @contextmanager
 def _own_signals() -> Iterator[None]:
-    """Keep this process's answer to SIGTERM: Ray puts one of its own in its place."""
+    """Keep this process's answers to Ctrl-C and SIGTERM while Ray starts.
+
+    Ray puts one of its own in the place of that to SIGTERM. And a process that is just being forked
+    has these answers too: Ctrl-C reaches it as well, but is not for it.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    own = signal.getsignal(signal.SIGTERM)
+    me, interrupt = os.getpid(), signal.getsignal(signal.SIGINT)
+    terminate = signal.getsignal(signal.SIGTERM)
+
+    def here(number: int, frame: FrameType | None) -> None:
+        if os.getpid() == me and callable(interrupt):
+            interrupt(number, frame)
+
+    if callable(interrupt):
+        signal.signal(signal.SIGINT, here)
     try:
         yield
-    except SystemExit:  # Ray's answer, while it starts
-        signal.signal(signal.SIGTERM, own)
+    except SystemExit:  # Ray's answer to SIGTERM
+        signal.signal(signal.SIGTERM, terminate)
         signal.raise_signal(signal.SIGTERM)
         raise
     finally:
-        signal.signal(signal.SIGTERM, own)
+        signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGTERM, terminate)
 
 
 @contextmanager
