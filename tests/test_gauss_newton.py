@@ -223,7 +223,7 @@ def test_servo_parameters_of_a_leg_come_back_from_a_replay() -> None:
     assert told.identified[gains].all()
     missed = np.abs(space.denormalise(fit.best) - truth) / (told.upper - told.lower)
     assert (missed[told.identified] < 1).all(), dict(zip(space.names, missed, strict=True))
-    assert space.denormalise(fit.best)[gains] == pytest.approx(truth[gains], rel=0.1)
+    assert space.denormalise(fit.best)[gains] == pytest.approx(truth[gains], rel=0.15)
 
 
 def _measured(problem: Problem) -> int:

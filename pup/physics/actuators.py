@@ -1,9 +1,9 @@
 """Torque laws of position servos, for many simulations at once.
 
 A law splits its torque into a part that the engine applies as it is and a viscous coefficient
-that the engine integrates implicitly. A servo's damping over a light link's inertia is stiffer
-than any step worth taking (0.7 N m s/rad on 3e-4 kg m² asks for 0.4 ms); taken implicitly, 2 ms
-is stable and the small-step limit is the same.
+that the engine integrates implicitly; `servo` keeps their sum within the law's limit. A servo's
+damping over a light link's inertia is stiffer than any step worth taking (0.7 N m s/rad on
+3e-4 kg m² asks for 0.4 ms); taken implicitly, 2 ms is stable and the small-step limit is the same.
 """
 
 from typing import Protocol
@@ -29,9 +29,13 @@ class TorqueLaw(Protocol):
     the model's."""
     passive: float
     """Viscous damping that stays when the torque is off, N m s/rad."""
+    steady: bool
+    """Whether the viscous coefficient stays the same from sub-step to sub-step."""
+    limit: Array
+    """Largest torque of the servo, broadcastable to (n_simulations, n_joints), N m."""
 
-    def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
-        """Torque of one sub-step.
+    def unlimited(self, error: Array, velocity: Array) -> tuple[Array, Array]:
+        """Torque of one sub-step, before any limit.
 
         Args:
           error: target minus position, shape (n_active, n_joints), rad. The active simulations
@@ -42,14 +46,6 @@ class TorqueLaw(Protocol):
           The applied torque (N m) and the viscous coefficient (N m s/rad), both of that shape.
         """
         ...
-
-
-def _clip(torque: Array, damping: Array, velocity: Array, limit: Array) -> None:
-    """Clip `torque - damping * velocity` to ±limit, in place; clipped, nothing is left to damp."""
-    total = torque - damping * velocity
-    clipped = ~(np.abs(total) < limit)
-    np.copysign(limit, total, out=torque, where=clipped)
-    np.copyto(damping, 0.0, where=clipped)
 
 
 class PD:
@@ -66,13 +62,12 @@ class PD:
         self.limit = per_joint(robot, candidates, "tau_max")
         self.armature = candidates["armature"][:, None] if "armature" in candidates else None
         self.passive = 0.0
+        self.steady = True
 
-    def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
+    def unlimited(self, error: Array, velocity: Array) -> tuple[Array, Array]:
         """See TorqueLaw."""
         n = len(error)
-        torque, damping = self.kp[:n] * error, self.kd[:n].copy()
-        _clip(torque, damping, velocity, self.limit[:n])
-        return torque, damping
+        return self.kp[:n] * error, self.kd[:n].copy()
 
 
 class NetworkPD:
@@ -102,6 +97,7 @@ class NetworkPD:
         self.scale = np.stack([rho * (options.kp_scale / 2), sigma * (options.kd_scale / 2)])
         self.limit = candidates["torque_limit"][:, None]
         self.passive = options.passive_damping
+        self.steady = False
         self.armature = np.full((1, 1), options.armature) if options.armature else None
         # Room for what every sub-step computes.
         self._hidden = np.empty_like(self.bias)
@@ -124,12 +120,27 @@ class NetworkPD:
         gains *= self.scale[:, :n]
         return gains[0], gains[1]
 
-    def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
+    def unlimited(self, error: Array, velocity: Array) -> tuple[Array, Array]:
         """See TorqueLaw."""
         torque, damping = self.gains(error, velocity)
         torque *= error
-        _clip(torque, damping, velocity, self.limit[: len(error)])
         return torque, damping
+
+
+def implicit_share(damping: Array, inertia: Array, timestep: float) -> Array:
+    """Share of a viscous torque to be taken implicitly, for one inertia exact whatever the step.
+
+    Of `inertia * dv/dt = -damping * v` a step that takes the share 1/(1 - exp(-x)) - 1/x, with
+    x = damping * timestep / inertia, implicitly and the rest explicitly ends at exp(-x) v: half of
+    it where damping is soft (second order), all of it where it is stiff (stable).
+
+    Args:
+      damping: viscous coefficients, N m s/rad.
+      inertia: what they brake, same shape, kg m².
+      timestep: s.
+    """
+    x = np.maximum(damping * (timestep / inertia), 1e-6)
+    return np.asarray(-1 / np.expm1(-x) - 1 / x)
 
 
 def per_joint(robot: RobotDescription, candidates: Candidates, kind: str) -> Array:

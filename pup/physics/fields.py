@@ -3,20 +3,16 @@
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
-import mujoco
-import mujoco.batch
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.physics.model import Model
 from pup.physics.parameters import Candidates
+from pup.physics.writer import FieldWriter
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
-
-FLOOR = "floor"
-"""Name of the floor's geom in a robot's MJCF; its friction is the ground's (priority 1)."""
 
 _AXES = ("x", "y", "z")
 
@@ -48,7 +44,7 @@ def scaled(
 
 
 def apply_fields(
-    batch: mujoco.batch.Batch,
+    writer: FieldWriter,
     robot: RobotDescription,
     model: Model,
     parameters: Candidates,
@@ -58,7 +54,7 @@ def apply_fields(
     """Write the model fields of every simulation.
 
     Args:
-      batch: the simulations.
+      writer: of the simulations' fields.
       robot: the robot.
       model: its compiled model.
       parameters: one row per simulation.
@@ -69,7 +65,6 @@ def apply_fields(
     Returns:
       Viscous damping outside the servo, shape (n_simulations, n_joints), N m s/rad.
     """
-    writer = _Writer(batch, model.compiled)
     each = len(parameters) // len(setups)
     for knob in robot.knobs:
         values = np.repeat([setup[knob.name] for setup in setups], each)
@@ -84,12 +79,11 @@ def apply_fields(
         writer.field("dof_armature")[:, model.dofs] = armature
     for name in parameters.space.names:
         _apply(writer, robot, model, name, parameters[name], viscous)
-    writer.done()
     return viscous
 
 
 def _apply(
-    writer: "_Writer",
+    writer: FieldWriter,
     robot: RobotDescription,
     model: Model,
     name: str,
@@ -98,6 +92,8 @@ def _apply(
 ) -> None:
     """Write one parameter; those of the torque law, which it reads itself, pass."""
     kind, _, place = name.partition("/")
+    if "@" in name:
+        return  # an effect beside the nominal model, see `terms`
     if kind == "torso_com" and robot.torso:
         writer.element("body_ipos", robot.torso)[:, _AXES.index(place)] += values
     elif kind == "com":
@@ -108,7 +104,9 @@ def _apply(
         writer.element("body_inertia", place)[:] *= values[:, None]
     elif kind == "ground_friction":
         if model.floating:
-            writer.element("geom_friction", FLOOR)[:, 0] = values
+            friction = writer.field("geom_friction")
+            for geom, _ in model.contacts:
+                friction[:, geom, 0] = values
     elif kind == "damping":
         viscous[:, _of_group(robot, place)] += values[:, None]
     elif kind == "coulomb":
@@ -128,33 +126,3 @@ _LAW_PARAMETERS = frozenset(
 
 def _of_group(robot: RobotDescription, group: str) -> NDArray[np.bool_]:
     return np.array([joint.group == group for joint in robot.joints])
-
-
-class _Writer:
-    """Per-simulation fields, with the constants MuJoCo derives from them kept in step."""
-
-    def __init__(self, batch: mujoco.batch.Batch, model: mujoco.MjModel) -> None:
-        self.batch = batch
-        self.model = model
-        self.stale = False
-
-    def field(self, name: str) -> Array:
-        """A model field, live, shape (n_simulations, ...)."""
-        self.stale |= name in mujoco.MjModel._setconst_inputs
-        return np.asarray(self.batch.expand(name))
-
-    def element(self, name: str, element: str) -> Array:
-        """One named element of a model field, live, shape (n_simulations, ...)."""
-        kind = {"jnt": "joint", "dof": "joint"}.get(name.split("_")[0], name.split("_")[0])
-        accessor = getattr(self.model, kind)
-        index = (
-            int(self.model.joint(element).dofadr[0])
-            if name.startswith("dof_")
-            else accessor(element).id
-        )
-        return self.field(name)[:, index]
-
-    def done(self) -> None:
-        """Recompute what follows from the fields written."""
-        if self.stale:
-            self.batch.set_const()

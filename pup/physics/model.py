@@ -14,6 +14,9 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Selection = slice | NDArray[np.int64]
 
+FLOOR = "floor"
+"""Name of the floor's geom in a robot's MJCF; its friction is the ground's (priority 1)."""
+
 # A simulation that breaks down is told by its trajectories, a model that is wrong by an exception.
 # MuJoCo would also print each, and write MUJOCO_LOG.TXT to wherever the user stands.
 _log = mujoco.MjLogConfig.get()
@@ -30,12 +33,15 @@ class Model:
       qpos: where the joints' positions stand in qpos, in the robot's order.
       dofs: where their velocities stand in qvel.
       floating: whether the torso is free.
+      contacts: geoms that say how the floor feels, each with its place: the feet in their order,
+        then the floor, for all else that falls on it.
     """
 
     compiled: mujoco.MjModel
     qpos: Selection
     dofs: Selection
     floating: bool
+    contacts: tuple[tuple[int, int], ...]
 
 
 @lru_cache(maxsize=32)
@@ -64,7 +70,9 @@ def compile_model(robot: RobotDescription, support: str) -> Model:
                 spec.delete(joint)
         spec.option.timestep = robot.timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        if support != "ground":
+        if support == "ground":
+            _floor_under_the_feet(robot, spec)
+        else:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         compiled = spec.compile()
     except ValueError as error:
@@ -81,7 +89,28 @@ def compile_model(robot: RobotDescription, support: str) -> Model:
         _selection(compiled.jnt_qposadr[ids]),
         _selection(compiled.jnt_dofadr[ids]),
         floating,
+        _contacts(robot, compiled),
     )
+
+
+def _contacts(robot: RobotDescription, model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
+    feet = [model.body(foot).id for foot in robot.feet]
+    pairs = [(g, feet.index(b)) for g, b in enumerate(model.geom_bodyid) if b in feet]
+    return (*pairs, *((g, len(feet)) for g in range(model.ngeom) if model.geom(g).name == FLOOR))
+
+
+def _floor_under_the_feet(robot: RobotDescription, spec: mujoco.MjSpec) -> None:
+    """Give the feet the floor's contact parameters, and the say: one foot's may then be changed."""
+    floor = next((geom for geom in spec.geoms if geom.name == FLOOR), None)
+    if floor is None:
+        return
+    for foot in robot.feet:
+        for geom in spec.body(foot).geoms:
+            if geom.contype or geom.conaffinity:
+                geom.priority = floor.priority + 1
+                geom.friction, geom.condim = floor.friction, floor.condim
+                geom.solref, geom.solimp = floor.solref, floor.solimp
+                geom.solmix, geom.margin, geom.gap = floor.solmix, floor.margin, floor.gap
 
 
 def _one_line(error: Exception) -> str:

@@ -12,10 +12,16 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.physics.actuators import LAWS, TorqueLaw
+from pup.physics.commands import Commands
+from pup.physics.encoders import Event, History
 from pup.physics.fields import apply_fields, scaled
 from pup.physics.model import Model, compile_model, starting_qpos
 from pup.physics.parameters import Candidates
+from pup.physics.rotations import multiply, roll_pitch
+from pup.physics.servo import Servos
 from pup.physics.simulator import Schedule, Trajectories, schedule, tick_slices
+from pup.physics.terms import Scene, Term, bind_terms
+from pup.physics.writer import FieldWriter
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
@@ -32,15 +38,6 @@ _BROKEN = [
 
 
 @dataclass(frozen=True)
-class _Event:
-    """The ticks in one sub-step: of which recordings, where they are stored, how far in."""
-
-    rows: NDArray[np.int64]
-    ticks: NDArray[np.int64]
-    fraction: Array
-
-
-@dataclass(frozen=True)
 class _Group:
     """Recordings of one support, longest first, so that those still running are the first ones.
 
@@ -49,31 +46,30 @@ class _Group:
       setups: the setup knobs of each recording.
       start: starting qpos of each, shape (n_recordings, nq).
       start_velocity: starting joint velocities, shape (n_recordings, n_joints).
-      target: mean targets per sub-step, shape (n_steps, n_recordings, n_joints).
+      commands: their targets.
       power: share of torque on, shape (n_steps, n_recordings).
       running: how many recordings still run in each sub-step.
       events: the ticks in each sub-step.
-      always_on: whether torque is never off.
     """
 
     model: Model
     setups: tuple[dict[str, float], ...]
     start: Array
     start_velocity: Array
-    target: Array
+    commands: Commands
     power: Array
     running: NDArray[np.int64]
-    events: tuple[_Event | None, ...]
-    always_on: bool
+    events: tuple[Event | None, ...]
 
 
 class MujocoSimulator:
     """Replays recordings with `mujoco.batch.Batch`.
 
-    All recordings of one support and many candidates advance together; a torque law computes the
-    torque of the whole batch at every sub-step. Positions between sub-steps are interpolated
-    linearly. Each thread runs batches of its own, so that the torques are computed on all cores
-    too; a simulation's result does not depend on the batch it is in.
+    All recordings of one support and many candidates advance together; a torque law, with the terms
+    that the candidates' columns name, computes the torques of the whole batch at every sub-step.
+    Positions between sub-steps are interpolated linearly. Each thread runs batches of its own, so
+    that the torques are computed on all cores too; a simulation's result does not depend on the
+    batch it is in.
 
     Args:
       robot: the robot.
@@ -146,7 +142,6 @@ class MujocoSimulator:
         members.sort(key=lambda i: -plans[i].steps)
         ordered = [plans[i] for i in members]
         steps = ordered[0].steps
-        target = np.stack([_extended(p.target, steps) for p in ordered], axis=1)
         power = np.stack([_extended(p.power, steps) for p in ordered], axis=1)
         start = [
             starting_qpos(self.robot, model, plans[i].start, self.recordings[i]) for i in members
@@ -156,11 +151,10 @@ class MujocoSimulator:
             setups=tuple(self.robot.setup(self.recordings[i].setup) for i in members),
             start=np.stack(start),
             start_velocity=np.stack([p.start_velocity for p in ordered]),
-            target=np.ascontiguousarray(target),
+            commands=Commands(ordered, self.robot.timestep),
             power=np.ascontiguousarray(power),
             running=np.sum([np.arange(steps) < p.steps for p in ordered], axis=0),
             events=_events(ordered, [self.ticks[i].start for i in members], steps),
-            always_on=bool((power == 1).all()),
         )
 
 
@@ -171,7 +165,7 @@ def _extended(values: Array, steps: int) -> Array:
 
 def _events(
     plans: Sequence[Schedule], first_tick: Sequence[int], steps: int
-) -> tuple[_Event | None, ...]:
+) -> tuple[Event | None, ...]:
     rows = np.concatenate([np.full(len(p.tick_step), i) for i, p in enumerate(plans)])
     ticks = np.concatenate(
         [f + np.arange(len(p.tick_step)) for f, p in zip(first_tick, plans, strict=True)]
@@ -181,7 +175,7 @@ def _events(
     order = np.argsort(step, kind="stable")
     edges = np.searchsorted(step[order], np.arange(steps + 1))
     return tuple(
-        _Event(rows[order[a:b]], ticks[order[a:b]], fraction[order[a:b]]) if b > a else None
+        Event(rows[order[a:b]], ticks[order[a:b]], fraction[order[a:b]]) if b > a else None
         for a, b in pairwise(edges)
     )
 
@@ -197,67 +191,96 @@ class _Run:
         law: Callable[[RobotDescription, Candidates], TorqueLaw],
     ) -> None:
         self.group = group
-        self.recordings, self.candidates = len(group.setups), len(candidates)
-        nsim = self.recordings * self.candidates
-        per_simulation = scaled(robot, candidates, group.setups)
+        self.candidates = len(candidates)
+        nsim = len(group.setups) * self.candidates
+        each = scaled(robot, candidates, group.setups)
         self.batch = mujoco.batch.Batch(group.model.compiled, nsim, 1)
-        self.law = law(robot, per_simulation)
-        self.viscous = apply_fields(
-            self.batch, robot, group.model, per_simulation, group.setups, self.law.armature
+        bound = law(robot, each)
+        writer = FieldWriter(self.batch, group.model.compiled)
+        viscous = bound.passive + apply_fields(
+            writer, robot, group.model, each, group.setups, bound.armature
         )
-        self.viscous += self.law.passive
-        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self.qpos[:] = np.repeat(group.start, self.candidates, axis=0)
-        self.qvel[:, group.model.dofs] = np.repeat(group.start_velocity, self.candidates, axis=0)
-        self.force = self.batch.bind("qfrc_applied")
-        self.damping = self.batch.expand("dof_damping")
+        scene = _scene(robot, group.model, bound, viscous.shape)
+        self.terms = bind_terms(each, scene)
+        for term in self.terms:
+            term.fields(writer)
+        writer.done()
+        delay = each["command_delay"] if "command_delay" in candidates else None
+        self.servos = Servos(
+            bound, group.commands, group.power, self.terms, scene, viscous, delay, self.candidates
+        )
+        self._start(nsim)
+        self.ids = np.arange(nsim, dtype=np.int32)
+        self.broken = np.zeros(nsim, dtype=bool)
+        age = _longest(self.terms, "delay", robot.timestep)
+        self.joints = History(nsim, len(robot.joints), age)
         self.feet = [group.model.compiled.body(foot).id for foot in robot.feet]
         if group.model.floating:
             self.places = self.batch.bind("xpos")
-            self.sensor = _sensor_quaternion(robot, group.model)
-        self.delay: tuple[NDArray[np.int64], Array] | None = None
-        if "command_delay" in candidates:
-            delay = (per_simulation["command_delay"] / robot.timestep).reshape(-1, self.candidates)
-            whole = np.floor(delay).astype(np.int64)
-            self.delay = whole, (delay - whole)[:, :, None]
-        self.ids = np.arange(nsim, dtype=np.int32)
-        self.broken = np.zeros(nsim, dtype=bool)
+            self.mount = _mount(robot, group.model)
+            self.torso = History(nsim, 4, _longest(self.terms, "tilt_delay", robot.timestep))
+
+    def _start(self, nsim: int) -> None:
+        """Put the simulations where the recordings start."""
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        start = np.repeat(self.group.start, self.candidates, axis=0)
+        for term in self.terms:
+            term.start(start)
+        self.qpos[:] = start
+        velocity = np.repeat(self.group.start_velocity, self.candidates, axis=0)
+        self.qvel[:, self.group.model.dofs] = velocity
+        self.force, self.damping = self.batch.bind("qfrc_applied"), self.batch.expand("dof_damping")
+        pushing = [term for term in self.terms if term.answers("push")]
+        if pushing:
+            wrenches = self.batch.bind("xfrc_applied")
+            for term in pushing:
+                term.push(wrenches)
+        self.bias = self.batch.bind("qfrc_bias") if self.servos.loaded else None
+        # Velocities stand half a sub-step before positions, see `simulator`.
+        acceleration = self.batch.bind("qacc")
+        model = self.group.model
+        sensed = self.servos.sense(self.qpos[:, model.qpos], self.qvel[:, model.dofs])
+        self._drive(0, nsim, sensed)
+        self.batch.forward()
+        self.qvel -= self.batch.model.opt.timestep / 2 * acceleration
+        for term in self.terms:
+            term.prepare()
 
     def into(self, out: Trajectories, part: slice) -> None:
         """Run to the end and write the candidates' part of the trajectories."""
-        qpos, dofs = self.group.model.qpos, self.group.model.dofs
+        observed: Event | None = None
+        n = len(self.ids)
         for step, (running, event) in enumerate(
             zip(self.group.running, self.group.events, strict=True)
         ):
+            sensed = self._sensed(n)
+            if observed is not None:
+                self._store(observed, out, part)
             n = int(running) * self.candidates
-            error = self._error(step, int(running), self.qpos[:n, qpos])
-            torque, damping = self.law.torque(error, self.qvel[:n, dofs])
-            if not self.group.always_on:
-                on = np.repeat(self.group.power[step, :running], self.candidates)[:, None]
-                torque *= on
-                damping *= on
-            damping += self.viscous[:n]
-            self.force[:n, dofs] = torque
-            self.damping[:n, dofs] = damping
-            if event is None:
-                self._advance(n)
-            else:
-                self._observed(event, n, out, part)
+            self._drive(step, n, (sensed[0][:n], sensed[1][:n]))
+            self._advance(n)
+            observed = event
+            if event is not None and self.group.model.floating:
+                self._store_feet(event, out, part)
+        self._sensed(n)
+        if observed is not None:
+            self._store(observed, out, part)
 
-    def _error(self, step: int, running: int, position: Array) -> Array:
-        """Target minus position of the running simulations, shape (n, n_joints)."""
-        by_recording = position.reshape(running, self.candidates, -1)
-        return (self._target(step, running) - by_recording).reshape(position.shape)
+    def _sensed(self, n: int) -> tuple[Array, Array]:
+        """What the first simulations' encoders tell at a sub-step, kept for the ticks around it."""
+        model = self.group.model
+        sensed = self.servos.sense(self.qpos[:n, model.qpos], self.qvel[:n, model.dofs])
+        self.joints.push(sensed[0])
+        if model.floating:
+            self.torso.push(self.qpos[:n, 3:7])
+        return sensed
 
-    def _target(self, step: int, running: int) -> Array:
-        """Targets of the running recordings, shape (running, n_candidates or 1, n_joints)."""
-        if self.delay is None:
-            return self.group.target[step, :running, None]
-        whole, share = (of[:running] for of in self.delay)
-        row = np.arange(running)[:, None]
-        newer = self.group.target[np.maximum(step - whole, 0), row]
-        older = self.group.target[np.maximum(step - whole - 1, 0), row]
-        return np.asarray((1 - share) * newer + share * older)
+    def _drive(self, step: int, n: int, sensed: tuple[Array, Array]) -> None:
+        """Apply what reaches the links in one sub-step."""
+        qpos, dofs = self.group.model.qpos, self.group.model.dofs
+        link = self.qpos[:n, qpos], self.qvel[:n, dofs]
+        bias = None if self.bias is None else self.bias[:n, dofs]
+        self.force[:n, dofs], self.damping[:n, dofs] = self.servos.torque(step, link, sensed, bias)
 
     def _advance(self, n: int) -> None:
         try:
@@ -266,47 +289,56 @@ class _Run:
             self.broken[error.ids] = True
             self.batch.reset(ids=error.ids)
 
-    def _observed(self, event: _Event, n: int, out: Trajectories, part: slice) -> None:
-        """Advance one sub-step and write the ticks in it."""
+    def _store(self, event: Event, out: Trajectories, part: slice) -> None:
+        """Write the ticks between the last two sub-steps."""
+        rows, fraction = self._rows(event)
+        _write(out.position, part, event, self._sound(rows, self.joints.read(rows, fraction)))
+        if self.group.model.floating:
+            torso = self.torso.read(rows, fraction)
+            torso /= np.linalg.norm(torso, axis=1, keepdims=True)
+            for term in self.terms:
+                if term.answers("tilt"):
+                    torso = term.tilt(torso, rows)
+            tilt = roll_pitch(multiply(torso, self.mount))
+            _write(out.tilt, part, event, self._sound(rows, tilt))
+
+    def _store_feet(self, event: Event, out: Trajectories, part: slice) -> None:
+        """Write the feet's places: derived ones describe the state before a sub-step."""
+        rows, _ = self._rows(event)
+        _write(out.feet, part, event, self._sound(rows, self.places[rows][:, self.feet]))
+
+    def _rows(self, event: Event) -> tuple[NDArray[np.int64], Array]:
         rows = (event.rows[:, None] * self.candidates + np.arange(self.candidates)).ravel()
-        if self.group.model.floating:
-            tilt = _roll_pitch(self.qpos[rows, 3:7], self.sensor)
-        before = self.qpos[rows][:, self.group.model.qpos]
-        self._advance(n)
-        after = self.qpos[rows][:, self.group.model.qpos]
-        fraction = np.repeat(event.fraction, self.candidates)[:, None]
+        return rows, np.repeat(event.fraction, self.candidates)[:, None]
+
+    def _sound(self, rows: NDArray[np.int64], values: Array) -> Array:
+        """The values, NaN for simulations that have broken down."""
         lost = self.broken[rows] | (self.batch.warning[rows, :, 1][:, _BROKEN] > 0).any(axis=1)
-        self._store(out.position, part, event, before + fraction * (after - before), lost)
-        if self.group.model.floating:
-            self._store(out.tilt, part, event, tilt, lost)
-            # Derived positions describe the state before the sub-step: the tick's own, to 2 ms.
-            self._store(out.feet, part, event, self.places[rows][:, self.feet], lost)
-
-    def _store(
-        self, to: Array, part: slice, event: _Event, values: Array, lost: NDArray[np.bool_]
-    ) -> None:
         values[lost] = np.nan
-        shaped = values.reshape(len(event.rows), self.candidates, *values.shape[1:])
-        to[part, event.ticks] = shaped.swapaxes(0, 1)
+        return values
 
 
-def _sensor_quaternion(robot: RobotDescription, model: Model) -> Array:
+def _write(to: Array, part: slice, event: Event, values: Array) -> None:
+    shaped = values.reshape(len(event.rows), -1, *values.shape[1:])
+    to[part, event.ticks] = shaped.swapaxes(0, 1)
+
+
+def _scene(robot: RobotDescription, model: Model, law: TorqueLaw, shape: tuple[int, ...]) -> Scene:
+    """What the terms of a batch know of their simulations."""
+    own = model.compiled.dof_armature[model.dofs]
+    armature = np.broadcast_to(own if law.armature is None else law.armature, shape)
+    inertia = model.compiled.dof_M0[model.dofs] - own + armature
+    return Scene(robot, model, robot.timestep, inertia, armature, np.broadcast_to(law.limit, shape))
+
+
+def _longest(terms: Sequence[Term], hook: str, timestep: float) -> Array | None:
+    """How old readings are by all terms together, in sub-steps; None where none says."""
+    ages = [getattr(term, hook)() for term in terms if term.answers(hook)]
+    return sum(ages) / timestep if ages else None
+
+
+def _mount(robot: RobotDescription, model: Model) -> Array:
     """The IMU's orientation in the torso."""
     if robot.imu_site is None:
         return np.array([1.0, 0, 0, 0])
     return np.array(model.compiled.site(robot.imu_site).quat)
-
-
-def _roll_pitch(torso: Array, sensor: Array) -> Array:
-    """Roll and pitch (Z-Y-X) of a sensor fixed in the torso, shape (n, 2), rad."""
-    w, x, y, z = torso.T
-    a, b, c, d = sensor
-    w, x, y, z = (
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    )
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return np.stack([roll, pitch], axis=1)

@@ -1,9 +1,12 @@
 """The replay protocol: recordings times candidate parameters in, trajectories out.
 
 Everything that asks what the robot would have done stands on it. A recording is first put on the
-engine's sub-step grid (`Schedule`), which knows nothing of ticks: targets become their mean over
-each sub-step, positions are interpolated back to the ticks, so any spacing of time is as good as
-another and a delay is a continuous parameter.
+engine's sub-step grid (`Schedule`): positions are interpolated back to the ticks, so any spacing of
+time is as good as another.
+
+An engine that moves with the velocity it has just changed keeps velocities half a sub-step behind
+positions. A force then acts at its position's time, and what belongs to sub-step n is what is
+commanded from n - 1/2 to n + 1/2: taken from n to n + 1, the joints would run ahead by half of one.
 """
 
 from collections.abc import Sequence
@@ -24,15 +27,18 @@ class Schedule:
     """One recording on a grid of sub-steps.
 
     Attributes:
-      target: mean target of each sub-step, shape (n_steps, n_joints), rad.
-      power: share of each sub-step with the torque on, shape (n_steps,).
+      time: of the ticks since the first, shape (n_ticks,), s.
+      held: target from each tick on, shape (n_ticks, n_joints), rad.
+      power: share of each sub-step, from half a one before to half a one after its
+        beginning, with the torque on, shape (n_steps,).
       start: first joint position, shape (n_joints,), rad.
       start_velocity: first joint velocity, shape (n_joints,), rad/s.
       tick_step: sub-step in which each tick falls, shape (n_ticks,).
       tick_fraction: where in it, 0 to 1, shape (n_ticks,).
     """
 
-    target: Array
+    time: Array
+    held: Array
     power: Array
     start: Array
     start_velocity: Array
@@ -42,7 +48,7 @@ class Schedule:
     @property
     def steps(self) -> int:
         """Number of sub-steps."""
-        return len(self.target)
+        return len(self.power)
 
 
 def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Schedule:
@@ -57,12 +63,13 @@ def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Sc
     elapsed = recording.time - recording.time[0]
     where = elapsed / timestep + 1e-9  # ticks on the grid stay on it
     step = where.astype(np.int64)
-    grid = np.arange(step[-1] + 2) * timestep
+    grid = (np.arange(step[-1] + 2) - 0.5) * timestep
     target = _held(recording.target[:, order])
     power = _held(recording.extras.get("torque_enabled", np.ones(len(elapsed)))[:, None])
     speeds = [recording.extras.get(f"velocity/{name}", np.zeros(1))[0] for name in joints]
     return Schedule(
-        target=_mean_over_steps(elapsed, target, grid),
+        time=elapsed,
+        held=target,
         power=_mean_over_steps(elapsed, power, grid)[:, 0],
         start=_start(recording.position[:, order], target),
         start_velocity=np.nan_to_num(np.array(speeds)),
@@ -96,8 +103,9 @@ def _start(position: Array, target: Array) -> Array:
 
 
 def _mean_over_steps(time: Array, held: Array, grid: Array) -> Array:
-    """Mean over each grid cell of a signal (n_ticks, n) held from tick to tick."""
-    knots = np.append(time, max(grid[-1], time[-1]) + 1.0)
+    """Mean over each grid cell of a signal (n_ticks, n) held from tick to tick, and before them."""
+    knots = np.concatenate([[time[0] - 1.0], time, [max(grid[-1], time[-1]) + 1.0]])
+    held = np.concatenate([held[:1], held])
     area = np.zeros((len(knots), held.shape[1]))
     area[1:] = np.cumsum(np.diff(knots)[:, None] * held, axis=0)
     at = np.stack([np.interp(grid, knots, column) for column in area.T], axis=1)

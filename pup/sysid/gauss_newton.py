@@ -24,6 +24,8 @@ STEPS = (1e-4, 1e-3, 1e-2)
 A torque that clips and a foot that lands kink what a replay returns: a narrow difference sees one
 side of a kink, a wide one the slope across many.
 """
+CURVATURE_STEP = 1e-3
+"""The same for the covariance: a wider one takes kinks for information."""
 FIRST_DAMPING = 1e-2
 DAMPINGS = 10.0 ** np.arange(-3.0, 2.0)
 """Damping factors tried at once, relative to the current one."""
@@ -121,7 +123,7 @@ def least_squares(
         else:
             converged = True
             break
-    jacobian = _jacobian(residuals, at, value, steps[-1])
+    jacobian = _jacobian(residuals, at, value, CURVATURE_STEP if step is None else step)
     freedom = max(1, len(value) - len(at))
     noise = float(np.sqrt(value @ value / freedom))
     covariance = _covariance(jacobian, noise, prior)

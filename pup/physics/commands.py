@@ -1,0 +1,103 @@
+"""The commands of recordings as an engine's sub-steps see them.
+
+Sub-step n lasts, for what drives it, from n - 1/2 to n + 1/2 (see `simulator`). A command that
+changes within it leaves two targets, the second for a share of it: a servo at its limit answers to
+each in turn, not to their mean. Commands may come late, by a time of its own for each simulation
+and joint, without any rounding to sub-steps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.simulator import Schedule
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a controller is told during one sub-step.
+
+    Attributes:
+      now: target at its end, shape (n_recordings, n_candidates or 1, n_joints), rad.
+      before: target at its beginning; None where no recording's changes.
+      share: of the sub-step for which `now` holds, broadcastable to them.
+    """
+
+    now: Array
+    before: Array | None
+    share: Array
+
+
+class Commands:
+    """The commands of some recordings, each held until its next.
+
+    Args:
+      plans: the recordings on the grid of sub-steps.
+      timestep: sub-step, s.
+    """
+
+    def __init__(self, plans: Sequence[Schedule], timestep: float) -> None:
+        self.timestep = timestep
+        ticks = max(len(p.time) for p in plans)
+        self.time = np.full((len(plans), ticks + 1), np.inf)
+        self.held = np.empty((len(plans), ticks + 1, plans[0].held.shape[1]))
+        for row, plan in enumerate(plans):
+            self.time[row, : len(plan.time)] = plan.time
+            self.held[row, : len(plan.held)] = plan.held
+            self.held[row, len(plan.held) :] = plan.held[-1]
+        self.steps = max(p.steps for p in plans)
+        self._cells = np.arange(self.steps + 1) * timestep
+        self._last = np.stack(
+            [np.maximum(np.searchsorted(row, self._cells, "right") - 1, 0) for row in self.time]
+        )
+        ends = (np.arange(self.steps + 1) - 0.5) * timestep
+        rows = np.stack(
+            [np.maximum(np.searchsorted(row, ends, "right") - 1, 0) for row in self.time], axis=1
+        )
+        self._row = rows[1:]
+        since = (ends[1:, None] - np.take_along_axis(self.time.T, rows[1:], axis=0)) / timestep
+        recordings = np.arange(len(plans))
+        changed = self.held[recordings, rows[1:]] != self.held[recordings, rows[:-1]]
+        self._before = rows[:-1]
+        self._share = np.where(changed.any(axis=2), np.clip(since, 0, 1), 1.0)
+        self._changes = (self._share < 1).cumsum(axis=1)
+
+    def on_time(self, step: int, running: int) -> Target:
+        """Targets of the running recordings, the same for all candidates."""
+        recordings = np.arange(running)
+        now = self.held[recordings, self._row[step, :running], None]
+        if not self._changes[step, running - 1]:
+            return Target(now, None, _ONE)
+        before = self.held[recordings, self._before[step, :running], None]
+        share = np.where(now == before, 1.0, self._share[step, :running, None, None])
+        return Target(now, before, share)
+
+    def late(self, step: int, lateness: Array) -> Target:
+        """Targets that arrive late.
+
+        Args:
+          step: the sub-step.
+          lateness: shape (n_recordings, n_candidates, n_joints or 1), s; negative for early.
+        """
+        end = (step + 0.5) * self.timestep - lateness
+        recordings = np.arange(len(lateness))[:, None, None]
+        now, row = self._held_at(end, recordings)
+        before, _ = self._held_at((step - 0.5) * self.timestep - lateness, recordings)
+        since = (end - self.time[recordings, row]) / self.timestep
+        return Target(now, before, np.where(now == before, 1.0, np.clip(since, 0, 1)))
+
+    def _held_at(
+        self, time: Array, recordings: NDArray[np.int64]
+    ) -> tuple[Array, NDArray[np.int64]]:
+        cell = np.clip((time / self.timestep).astype(np.int64), 0, self.steps)
+        row = self._last[recordings, cell]
+        row = row + (self.time[recordings, row + 1] <= time)
+        joints = np.arange(self.held.shape[2])
+        return self.held[recordings, row, joints], row
+
+
+_ONE = np.ones(())

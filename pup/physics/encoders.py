@@ -1,0 +1,62 @@
+"""What a recording's ticks see of the simulations: encoders and IMU, read between sub-steps.
+
+Readings are interpolated between sub-steps. Some are older than their rows say, by a time of their
+own for each simulation and joint: the last sub-steps are kept for them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Event:
+    """The ticks that fall between a sub-step and the next.
+
+    Attributes:
+      rows: of which recordings.
+      ticks: where they are stored in packed arrays.
+      fraction: how far after the sub-step, of one.
+    """
+
+    rows: NDArray[np.int64]
+    ticks: NDArray[np.int64]
+    fraction: Array
+
+
+class History:
+    """The last values of a signal of all simulations, readable between sub-steps.
+
+    Args:
+      simulations: how many.
+      width: values of each.
+      age: how old the readings are, broadcastable to (n_simulations, width), sub-steps; None where
+        none is.
+    """
+
+    def __init__(self, simulations: int, width: int, age: Array | None) -> None:
+        self.age = age
+        depth = 2 if age is None else int(np.ceil(age.max())) + 2
+        self.values = np.zeros((depth, simulations, width))
+        self.count = 0
+
+    def push(self, values: Array) -> None:
+        """Take the values of the first simulations at one more sub-step."""
+        self.values[self.count % len(self.values), : len(values)] = values
+        self.count += 1
+
+    def read(self, rows: NDArray[np.int64], fraction: Array) -> Array:
+        """Values of some simulations, a fraction (n, 1) of a sub-step after the last but one."""
+        last = self.count - 2
+        if self.age is None:
+            before, after = (self.values[(last + i) % 2, rows] for i in (0, 1))
+            return np.asarray(before + fraction * (after - before))
+        since = np.maximum(fraction - self.age[rows], -last)  # it stood still before the start
+        floor = np.floor(since)
+        whole, share = last + floor.astype(np.int64), since - floor
+        depth, column = len(self.values), np.arange(self.values.shape[2])
+        before, after = (self.values[(whole + i) % depth, rows[:, None], column] for i in (0, 1))
+        return np.asarray(before + share * (after - before))

@@ -1,0 +1,201 @@
+"""What a servo does beside its law: limits, losses and controllers nobody wrote down."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.terms.base import Drive, Flow, Quantity, Term
+
+Array = NDArray[np.float64]
+
+
+class QuadraticDamping(Term):
+    """A torque that brakes with the square of the speed."""
+
+    effect = "quadratic_damping"
+    quantities = (Quantity("coefficient", "N m s2/rad2", 0.04, 0.5),)
+    source = "estimate: 0.03 to 0.1"
+
+    def flow(self, flow: Flow) -> None:
+        """See Term."""
+        flow.damping += self.values["coefficient"][: len(flow.torque)] * np.abs(flow.velocity)
+
+
+class TorqueSpeedLimit(Term):
+    """A motor's largest torque falls with its speed: back-EMF eats the voltage."""
+
+    effect = "torque_speed_limit"
+    quantities = (Quantity("slope", "N m s/rad", 0.2, 1.5),)
+    source = "MX-28 e-manual: 2.5 N m at rest, 55 rpm free: 0.43 N m s/rad"
+
+    def drive(self, drive: Drive) -> None:
+        """See Term."""
+        loss = self.values["slope"][: len(drive.torque)] * drive.velocity
+        drive.upper -= np.maximum(loss, 0.0)
+        drive.lower -= np.minimum(loss, 0.0)
+        np.maximum(drive.upper, 0.0, out=drive.upper)
+        np.minimum(drive.lower, 0.0, out=drive.lower)
+
+
+class ActuatorLag(Term):
+    """The torque follows what the law asks for with a time constant."""
+
+    effect = "actuator_lag"
+    quantities = (Quantity("time", "s", 0.008, 0.06),)
+    source = "estimate: 5 to 15 ms of current loop and filters"
+
+    def prepare(self) -> None:
+        """See Term."""
+        self._share = -np.expm1(-self.scene.timestep / np.maximum(self.values["time"], 1e-9))
+        self._torque: Array | None = None
+        self._damping = np.zeros_like(self._share)
+
+    def flow(self, flow: Flow) -> None:
+        """See Term."""
+        n = len(flow.torque)
+        share, lagging = self._share[:n], self.values["time"][:n] > 0
+        if self._torque is None:
+            self._torque = flow.torque - flow.damping * flow.velocity
+        else:  # what the last sub-step came to, by the velocity at its end
+            self._torque[:n] -= self._damping[:n] * flow.velocity
+        torque = self._torque[:n]
+        torque += share * (flow.torque - torque)
+        self._damping[:n] = share * flow.damping
+        np.copyto(flow.torque, torque, where=lagging)
+        np.copyto(flow.damping, self._damping[:n], where=lagging)
+
+
+class VoltageSag(Term):
+    """Gains and limits of all servos fall with the torque that all of them give together."""
+
+    effect = "voltage_sag"
+    kinds = ("bus",)
+    quantities = (Quantity("drop", "1/(N m)", 0.03, 0.5),)
+    source = "estimate: 5 to 15 % under the load of several joints"
+
+    def prepare(self) -> None:
+        """See Term."""
+        self._left = np.ones_like(self.values["drop"])
+
+    def drive(self, drive: Drive) -> None:
+        """See Term."""
+        left = self._left[: len(drive.torque)]
+        drive.torque *= left
+        drive.upper *= left
+        drive.lower *= left
+
+    def settle(self, error: Array, torque: Array) -> None:
+        """See Term."""
+        n = len(torque)
+        load = self.values["drop"][:n] * np.abs(torque).sum(axis=1, keepdims=True)
+        self._left[:n] = 1 / (1 + load)  # the supply's own resistance also limits what it gives
+
+
+class ThermalDrift(Term):
+    """Gains and limits drift with the time since the recording's start; positive weakens."""
+
+    effect = "thermal_drift"
+    kinds = ("joint", "group", "robot")
+    quantities = (Quantity("rate", "1/s", 0.005, 0.05, signed=True),)
+    source = "a 3S battery from 12.6 to 10.5 V loses 17 %, copper at +50 K 20 %"
+
+    def drive(self, drive: Drive) -> None:
+        """See Term."""
+        left = np.maximum(1 - self.values["rate"][: len(drive.torque)] * drive.time, 0.05)
+        drive.torque *= left
+        drive.upper *= left
+        drive.lower *= left
+
+
+class GainAsymmetry(Term):
+    """A stiffer pull in one direction; positive is stiffer for positive errors."""
+
+    effect = "gain_asymmetry"
+    kinds = ("joint",)
+    quantities = (Quantity("share", "1", 0.06, 0.5, signed=True),)
+    source = "SO-101 servos: 6 to 8 % by our own fits of real recordings"
+
+    def drive(self, drive: Drive) -> None:
+        """See Term."""
+        share = self.values["share"][: len(drive.torque)]
+        drive.torque *= np.where(drive.error > 0, 1 + share, 1 - share)
+
+
+class IntegralAction(Term):
+    """A controller's integral part, which stops growing at the servo's limit."""
+
+    effect = "integral_action"
+    quantities = (Quantity("gain", "N m/(rad s)", 15.0, 300.0),)
+    source = "estimate: an integral gain that takes a second to double the proportional part"
+
+    def prepare(self) -> None:
+        """See Term."""
+        self._sum = np.zeros_like(self.values["gain"])
+
+    def drive(self, drive: Drive) -> None:
+        """See Term."""
+        n = len(drive.torque)
+        drive.torque += self.values["gain"][:n] * self._sum[:n]
+
+    def settle(self, error: Array, torque: Array) -> None:
+        """See Term."""
+        n = len(error)
+        grown = self._sum[:n] + self.scene.timestep * error
+        most = self.scene.limit[:n] / np.maximum(self.values["gain"][:n], 1e-9)
+        self._sum[:n] = np.clip(grown, -most, most)
+
+
+class DeadBand(Term):
+    """Errors below a width count as none, larger ones as less by it."""
+
+    effect = "dead_band"
+    quantities = (Quantity("width", "rad", 0.004, 0.05),)
+    source = "one encoder step (MX-28: 1.5 mrad) to 0.29 degrees (RX-28 manual, margin)"
+
+    def error(self, error: Array) -> Array:
+        """See Term."""
+        width = self.values["width"][: len(error)]
+        return np.copysign(np.maximum(np.abs(error) - width, 0.0), error)
+
+
+class TargetRateLimit(Term):
+    """The controller's goal moves at most at some speed towards the command."""
+
+    effect = "target_rate_limit"
+    kinds = ("joint", "group", "bus")
+    quantities = (Quantity("slowness", "s/rad", 0.25, 2.0),)
+    source = "3 to 5 rad/s; BAM (arXiv:2410.08650) has it in the STS3215"
+
+    def prepare(self) -> None:
+        """See Term."""
+        slowness = self.values["slowness"]
+        self._reach = self.scene.timestep / np.maximum(slowness, 1e-9)
+        self._goal: Array | None = None
+
+    def command(self, now: Array, before: Array) -> tuple[Array, Array]:
+        """See Term."""
+        n = len(now)
+        if self._goal is None:
+            self._goal = before.copy()
+        goal = self._goal[:n]
+        goal += np.clip(now - goal, -self._reach[:n], self._reach[:n])
+        limited = self.values["slowness"][:n] > 0
+        return np.where(limited, goal, now), np.where(limited, goal, before)
+
+
+class Cogging(Term):
+    """A torque that ripples with the joint's angle."""
+
+    effect = "cogging"
+    quantities = (
+        Quantity("sine", "N m", 0.03, 0.4, signed=True),
+        Quantity("cosine", "N m", 0.03, 0.4, signed=True),
+        Quantity("teeth", "1", 24.0, 200.0, grid=(8.0, 12.0, 16.0, 24.0, 32.0, 48.0)),
+    )
+    source = "estimate: 0.02 to 0.06 N m"
+
+    def flow(self, flow: Flow) -> None:
+        """See Term."""
+        n = len(flow.torque)
+        turn = self.values["teeth"][:n] * flow.position
+        flow.torque += self.values["sine"][:n] * np.sin(turn)
+        flow.torque += self.values["cosine"][:n] * np.cos(turn)

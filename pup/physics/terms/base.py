@@ -1,0 +1,217 @@
+"""What a physics term is: an effect the nominal model leaves out, with continuous parameters.
+
+A term's magnitudes are zero in the nominal model, and at zero it changes no bit of a simulation.
+Its shapes (a speed, an angle, a number of teeth) say how it acts when it does, and mean nothing at
+zero. A term acts on a batch of simulations at once, at any of its places, through the hooks of
+`Term`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.model import Model
+from pup.physics.writer import FieldWriter
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+Kind = Literal["joint", "group", "body", "foot", "ground", "sensor", "bus", "robot"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One parameter of a term.
+
+    Attributes:
+      name: such as `torque`.
+      unit: its unit; `1` for a plain number.
+      typical: size of a magnitude that a lab meets, or the usual value of a shape.
+      limit: largest size to try; a signed quantity is tried down to its negative.
+      signed: whether it may be negative.
+      grid: values of a shape among which a first search chooses; empty for a magnitude.
+    """
+
+    name: str
+    unit: str
+    typical: float
+    limit: float
+    signed: bool = False
+    grid: tuple[float, ...] = ()
+
+    @property
+    def shape(self) -> bool:
+        """Whether it only says how the term acts, not how much."""
+        return bool(self.grid)
+
+    @property
+    def nominal(self) -> float:
+        """Its value in the nominal model."""
+        return self.typical if self.shape else 0.0
+
+    @property
+    def lower(self) -> float:
+        """Smallest value to try."""
+        if self.signed:
+            return -self.limit
+        return min(self.grid) / 3 if self.shape else 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the terms of one batch know of their simulations.
+
+    Attributes:
+      robot: the robot.
+      model: its compiled model.
+      timestep: sub-step, s.
+      inertia: what each joint moves in the model's own pose, kg m²; like the others of shape
+        (n_simulations, n_joints).
+      armature: the rotors' share of it, kg m².
+      limit: largest torque of the servos, N m.
+    """
+
+    robot: RobotDescription
+    model: Model
+    timestep: float
+    inertia: Array
+    armature: Array
+    limit: Array
+
+
+@dataclass
+class Drive:
+    """A servo's static law in the making; arrays of shape (n_active, n_joints).
+
+    Attributes:
+      time: since the recording's start, s.
+      error: target minus sensed position, rad.
+      velocity: sensed, rad/s.
+      torque: of the proportional part, N m.
+      upper: largest torque of the servo, N m.
+      lower: smallest one.
+    """
+
+    time: float
+    error: Array
+    velocity: Array
+    torque: Array
+    upper: Array
+    lower: Array
+
+
+@dataclass
+class Flow:
+    """A torque on its way from the servo to the link; arrays of shape (n_active, n_joints).
+
+    Attributes:
+      time: since the recording's start, s.
+      position: of the link, rad.
+      velocity: of the link, rad/s.
+      bias: torque of gravity and motion that the joint holds against, N m; only where a term asks
+        for it.
+      torque: applied as it is, N m.
+      damping: applied times the velocity at the sub-step's end, N m s/rad.
+    """
+
+    time: float
+    position: Array
+    velocity: Array
+    bias: Array | None
+    torque: Array
+    damping: Array
+
+
+class Term:
+    """An omitted effect, bound to the simulations of one batch.
+
+    Attributes:
+      effect: its name, of CONTRACTS.md, section 6.
+      kinds: places it can act at.
+      quantities: its parameters, magnitudes first.
+      source: where the typical sizes come from.
+      layout: what the columns of the values are: the joints, the joints that carry a body, the
+        model's bodies, the feet and the floor, or one for all.
+      loaded: whether it needs `Flow.bias`.
+
+    Args:
+      values: each quantity, shape (n_simulations, n_places), see `layout`.
+      scene: what it acts on.
+    """
+
+    effect: ClassVar[str]
+    kinds: ClassVar[tuple[Kind, ...]] = ("joint", "group")
+    quantities: ClassVar[tuple[Quantity, ...]]
+    source: ClassVar[str]
+    layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
+    loaded: ClassVar[bool] = False
+
+    def __init__(self, values: Mapping[str, Array], scene: Scene) -> None:
+        self.values = values
+        self.scene = scene
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Make the term's state."""
+
+    def fields(self, writer: FieldWriter) -> None:
+        """Write model fields."""
+
+    def start(self, qpos: Array) -> None:
+        """See, and change in place, the starting configurations, (n_simulations, nq)."""
+
+    def lateness(self, time: float, n: int) -> Array:
+        """By how much commands come late, (n, n_joints) or (n, 1), s."""
+        raise NotImplementedError
+
+    def command(self, now: Array, before: Array) -> tuple[Array, Array]:
+        """Change the targets that reach the controller at a sub-step's end and beginning."""
+        raise NotImplementedError
+
+    def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """What the encoder tells of position and velocity."""
+        raise NotImplementedError
+
+    def error(self, error: Array) -> Array:
+        """Change the controller's error."""
+        raise NotImplementedError
+
+    def drive(self, drive: Drive) -> None:
+        """Change the servo's torque and its limits, in place; keeps no state."""
+        raise NotImplementedError
+
+    def settle(self, error: Array, torque: Array) -> None:
+        """Take note of a sub-step's error and servo torque."""
+        raise NotImplementedError
+
+    def flow(self, flow: Flow) -> None:
+        """Change what reaches the link, in place."""
+        raise NotImplementedError
+
+    def push(self, xfrc: Array) -> None:
+        """Add to the wrenches on the bodies, (n_simulations, n_bodies, 6), once at the start."""
+        raise NotImplementedError
+
+    def delay(self) -> Array:
+        """By how much readings of positions are old, (n_simulations, n_joints), s."""
+        raise NotImplementedError
+
+    def tilt(self, quaternion: Array, rows: NDArray[np.int64]) -> Array:
+        """Change the torso's orientation, (n, 4), as the IMU tells it, of some simulations."""
+        raise NotImplementedError
+
+    def tilt_delay(self) -> Array:
+        """By how much the IMU's readings are old, (n_simulations, 1), s."""
+        raise NotImplementedError
+
+    @classmethod
+    def answers(cls, hook: str) -> bool:
+        """Whether the term has a hook of its own."""
+        return getattr(cls, hook) is not getattr(Term, hook)
+
+    @classmethod
+    def magnitudes(cls) -> tuple[Quantity, ...]:
+        """The quantities that are zero in the nominal model."""
+        return tuple(q for q in cls.quantities if not q.shape)

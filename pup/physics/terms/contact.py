@@ -1,0 +1,94 @@
+"""What the ground is like beyond one friction coefficient."""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.rotations import CONJUGATE, multiply, rotation
+from pup.physics.terms.base import Quantity, Term
+from pup.physics.writer import FieldWriter
+
+Array = NDArray[np.float64]
+
+
+class GroundCompliance(Term):
+    """A softer floor: contacts take longer to push back."""
+
+    effect = "ground_compliance"
+    kinds = ("ground", "foot")
+    layout = "feet"
+    quantities = (Quantity("time", "s", 0.02, 0.2),)
+    source = "a yoga mat of 6 mm foam, as in the paper: 100 to 300 N m/rad at the ankle"
+
+    def fields(self, writer: FieldWriter) -> None:
+        """See Term."""
+        solref = writer.field("geom_solref")
+        for geom, column in self.scene.model.contacts:
+            solref[:, geom, 0] += self.values["time"][:, column]
+
+
+class ContactRestitution(Term):
+    """A livelier contact: it damps less of an impact."""
+
+    effect = "contact_restitution"
+    kinds = ("ground", "foot")
+    layout = "feet"
+    quantities = (Quantity("share", "1", 0.4, 0.95),)
+    source = "estimate"
+
+    def fields(self, writer: FieldWriter) -> None:
+        """See Term."""
+        solref = writer.field("geom_solref")
+        for geom, column in self.scene.model.contacts:
+            solref[:, geom, 1] *= 1 - self.values["share"][:, column]
+
+
+class GroundFriction(Term):
+    """One foot's friction differs from the floor's."""
+
+    effect = "ground_friction"
+    kinds = ("foot",)
+    layout = "feet"
+    quantities = (Quantity("change", "1", 0.3, 1.0, signed=True),)
+    source = "estimate: rubber 1.0 to plastic 0.4"
+
+    def fields(self, writer: FieldWriter) -> None:
+        """See Term."""
+        friction = writer.field("geom_friction")
+        for geom, column in self.scene.model.contacts:
+            changed = friction[:, geom, 0] + self.values["change"][:, column]
+            friction[:, geom, 0] = np.maximum(changed, 0.02)
+
+
+class GroundSlope(Term):
+    """The floor leans: gravity is turned against it, and with it what the IMU tells."""
+
+    effect = "ground_slope"
+    kinds = ("ground",)
+    layout = "one"
+    quantities = (
+        Quantity("roll", "rad", 0.02, 0.3, signed=True),
+        Quantity("pitch", "rad", 0.02, 0.3, signed=True),
+    )
+    source = "estimate: a degree of an uneven floor"
+
+    def prepare(self) -> None:
+        """See Term."""
+        both = np.hstack([self.values["roll"], self.values["pitch"]])
+        self._lean = rotation(np.hstack([both, np.zeros((len(both), 1))]))
+        self._back = self._lean * CONJUGATE
+
+    def fields(self, writer: FieldWriter) -> None:
+        """See Term."""
+        gravity = writer.field("opt.gravity")
+        for row in np.flatnonzero(self._lean[:, 1:].any(axis=1)):
+            mujoco.mju_rotVecQuat(gravity[row], gravity[row].copy(), self._back[row])
+
+    def start(self, qpos: Array) -> None:
+        """See Term: the torso was read against gravity."""
+        leaning = self._lean[:, 1:].any(axis=1)
+        qpos[leaning, 3:7] = multiply(self._back[leaning], qpos[leaning, 3:7])
+
+    def tilt(self, quaternion: Array, rows: NDArray[np.int64]) -> Array:
+        """See Term."""
+        return multiply(self._lean[rows], quaternion)

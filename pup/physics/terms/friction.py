@@ -1,0 +1,145 @@
+"""Dry friction in its kinds: a bristle that holds until it slips, and what its grip depends on."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.terms.base import Flow, Quantity, Term
+
+Array = NDArray[np.float64]
+
+GRIP = 3e-4
+"""How far a joint gives before dry friction slips, rad: a fifth of an MX-28's encoder step."""
+
+
+class Friction(Term):
+    """Friction of some level on a joint, as the deflection of a bristle (Dahl 1968).
+
+    The bristle follows the joint and slips at `level`; its deflection is integrated implicitly, so
+    that however stiff it is, the joint rests where friction holds it.
+    """
+
+    def prepare(self) -> None:
+        """See Term."""
+        shape = next(iter(self.values.values())).shape
+        self._bend = np.zeros(shape)
+        self._slip = np.ones(shape)
+
+    def flow(self, flow: Flow) -> None:
+        """See Term."""
+        n, step, velocity = len(flow.torque), self.scene.timestep, flow.velocity
+        length = self.length(n)
+        bend, slip = self._bend[:n], self._slip[:n]
+        bend += step * velocity
+        bend /= slip
+        slip[:] = 1 + np.abs(velocity) * (step / length)
+        stiffness = self.level(flow) / length / slip
+        flow.torque -= stiffness * bend
+        flow.damping += stiffness * step
+
+    def level(self, flow: Flow) -> Array:
+        """Friction torque of a joint that slips, N m."""
+        raise NotImplementedError
+
+    def length(self, n: int) -> Array | float:
+        """How far a joint gives before it slips, rad."""
+        return GRIP
+
+
+class CoulombFriction(Friction):
+    """Friction of one level whatever the speed."""
+
+    effect = "coulomb_friction"
+    quantities = (Quantity("torque", "N m", 0.08, 1.0),)
+    source = "BAM M1 of the MX-64 (arXiv:2410.08650): 0.09 N m"
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        return self.values["torque"][: len(flow.torque)]
+
+
+class StribeckFriction(Friction):
+    """Friction that is higher at rest than when sliding."""
+
+    effect = "stribeck_friction"
+    quantities = (
+        Quantity("torque", "N m", 0.05, 1.0),
+        Quantity("rest", "N m", 0.06, 1.0),
+        Quantity("speed", "rad/s", 0.5, 6.0, grid=(0.1, 0.5, 2.0)),
+    )
+    source = "BAM M4 to M6 (arXiv:2410.08650): 0.02 to 0.12 N m more at rest, 1.5 to 2.6 rad/s"
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        n = len(flow.torque)
+        fade = np.exp(-np.abs(flow.velocity) / self.values["speed"][:n])
+        return self.values["torque"][:n] + self.values["rest"][:n] * fade
+
+
+class PreslidingHysteresis(Friction):
+    """Dry friction with a wide elastic range before it slips."""
+
+    effect = "presliding_hysteresis"
+    quantities = (
+        Quantity("torque", "N m", 0.08, 1.0),
+        Quantity("deflection", "rad", 0.006, 0.05, grid=(0.003, 0.008, 0.02)),
+    )
+    source = "estimate: a LuGre bristle gives 3 mrad before it slips"
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        return self.values["torque"][: len(flow.torque)]
+
+    def length(self, n: int) -> Array:
+        """See Friction."""
+        return self.values["deflection"][:n]
+
+
+class LoadDependentFriction(Friction):
+    """Friction that grows with what the gear carries: motor against gravity and motion."""
+
+    effect = "load_dependent_friction"
+    quantities = (Quantity("share", "1", 0.15, 0.8),)
+    source = "BAM M4 to M6 (arXiv:2410.08650): 0.22 to 0.31 on MX-64 and MX-106"
+    loaded = True
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        assert flow.bias is not None
+        load = np.abs(flow.torque - flow.damping * flow.velocity + flow.bias)
+        return self.values["share"][: len(load)] * load
+
+
+class GearEfficiency(Friction):
+    """A share of the motor's torque lost in the gear, whichever way power flows."""
+
+    effect = "gear_efficiency"
+    quantities = (Quantity("loss", "1", 0.2, 0.8),)
+    source = "estimate: 0.7 to 0.9 for servo gears; BAM M5 and M6"
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        carried = np.abs(flow.torque - flow.damping * flow.velocity)
+        return self.values["loss"][: len(carried)] * carried
+
+
+class FrictionAsymmetry(Friction):
+    """Friction in one direction only, dry and viscous; positive brakes positive motion."""
+
+    effect = "friction_asymmetry"
+    kinds = ("joint",)
+    quantities = (
+        Quantity("torque", "N m", 0.04, 0.5, signed=True),
+        Quantity("viscous", "N m s/rad", 0.05, 0.6, signed=True),
+    )
+    source = "EMPS (Janot, Gautier, Brunot 2019): viscous friction 166.7 forward, 240.4 backward"
+
+    def flow(self, flow: Flow) -> None:
+        """See Friction."""
+        viscous = self.values["viscous"][: len(flow.torque)]
+        flow.damping += np.where(viscous * flow.velocity > 0, np.abs(viscous), 0.0)
+        super().flow(flow)
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        torque = self.values["torque"][: len(flow.torque)]
+        return np.where(torque * flow.velocity > 0, np.abs(torque), 0.0)

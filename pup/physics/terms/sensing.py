@@ -1,0 +1,101 @@
+"""What encoders and the IMU tell, where it is not what is."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.physics.rotations import multiply, rotation
+from pup.physics.terms.base import Quantity, Term
+
+Array = NDArray[np.float64]
+
+
+class EncoderBias(Term):
+    """The encoder's zero is off: what it tells is the position plus this."""
+
+    effect = "encoder_bias"
+    kinds = ("joint",)
+    quantities = (Quantity("offset", "rad", 0.02, 0.3, signed=True),)
+    source = "estimate: 5 to 50 mrad after reassembly"
+
+    def start(self, qpos: Array) -> None:
+        """See Term: what was read first has the bias in it."""
+        qpos[:, self.scene.model.qpos] -= self.values["offset"]
+
+    def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """See Term."""
+        return position + self.values["offset"][: len(position)], velocity
+
+
+class EncoderEccentricity(Term):
+    """The encoder's magnet is off centre: an error with a period of one turn."""
+
+    effect = "encoder_eccentricity"
+    kinds = ("joint",)
+    quantities = (
+        Quantity("sine", "rad", 0.01, 0.1, signed=True),
+        Quantity("cosine", "rad", 0.01, 0.1, signed=True),
+    )
+    source = "estimate: 5 to 12 mrad"
+
+    def start(self, qpos: Array) -> None:
+        """See Term."""
+        where = self.scene.model.qpos
+        qpos[:, where] -= self._off(qpos[:, where])
+
+    def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """See Term."""
+        return position + self._off(position), velocity
+
+    def _off(self, position: Array) -> Array:
+        n = len(position)
+        sine, cosine = self.values["sine"][:n], self.values["cosine"][:n]
+        return sine * np.sin(position) + cosine * np.cos(position)
+
+
+class MeasurementDelay(Term):
+    """Positions are read earlier than their rows say; the servo's own loop is not late."""
+
+    effect = "measurement_delay"
+    kinds = ("joint", "group", "bus")
+    quantities = (Quantity("time", "s", 0.01, 0.06),)
+    source = "reading 20 servos one after the other takes 10 ms (paper, section III)"
+
+    def delay(self) -> Array:
+        """See Term."""
+        return self.values["time"]
+
+
+class ImuMisalignment(Term):
+    """The IMU is mounted with a turn against its site."""
+
+    effect = "imu_misalignment"
+    kinds = ("sensor",)
+    layout = "one"
+    quantities = (
+        Quantity("roll", "rad", 0.03, 0.4, signed=True),
+        Quantity("pitch", "rad", 0.03, 0.4, signed=True),
+        Quantity("yaw", "rad", 0.05, 0.6, signed=True),
+    )
+    source = "the paper randomises the orientation by 0.3 rad (section VI)"
+
+    def prepare(self) -> None:
+        """See Term."""
+        self._mount = rotation(np.hstack([self.values[a] for a in ("roll", "pitch", "yaw")]))
+
+    def tilt(self, quaternion: Array, rows: NDArray[np.int64]) -> Array:
+        """See Term."""
+        return multiply(quaternion, self._mount[rows])
+
+
+class ImuDelay(Term):
+    """The IMU's angles are older than their rows say."""
+
+    effect = "imu_delay"
+    kinds = ("sensor",)
+    layout = "one"
+    quantities = (Quantity("time", "s", 0.02, 0.1),)
+    source = "estimate: 10 to 30 ms of fusion filter"
+
+    def tilt_delay(self) -> Array:
+        """See Term."""
+        return self.values["time"]
