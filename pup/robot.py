@@ -20,6 +20,7 @@ from pup.robot_parts import (
     NetworkOptions,
     ParameterSpec,
     Scaling,
+    TermSpec,
 )
 from pup.robot_reader import (
     read_feet,
@@ -33,6 +34,7 @@ from pup.robot_reader import (
     read_torso,
 )
 from pup.robot_space import read_knobs, read_parameters
+from pup.robot_terms import read_terms
 from pup.robot_toml import Table, read_text
 
 __all__ = [
@@ -46,6 +48,7 @@ __all__ = [
     "ParameterSpec",
     "RobotDescription",
     "Scaling",
+    "TermSpec",
     "built_in_robots",
 ]
 
@@ -69,6 +72,7 @@ class RobotDescription:
       poses: named joint vectors, rad.
       knobs: what a recording's setup may set.
       parameters: the parameter space, in order.
+      terms: what the physics has beside the nominal model.
       gait: the reference motion, if any.
       network: options of the NN-PD actuator; None where it is not offered.
       timestep: physics step, s.
@@ -86,6 +90,7 @@ class RobotDescription:
     poses: dict[str, tuple[float, ...]]
     knobs: tuple[Knob, ...]
     parameters: tuple[ParameterSpec, ...]
+    terms: tuple[TermSpec, ...]
     gait: Gait | None
     network: NetworkOptions | None
     timestep: float
@@ -108,6 +113,7 @@ class RobotDescription:
         joints = read_joints(table, model)
         groups = read_groups(table, joints)
         torso = read_torso(table, model)
+        feet = read_feet(table, model)
         parameters = read_parameters(table, groups, torso, model)
         robot = cls(
             name=table.name("name"),
@@ -116,11 +122,12 @@ class RobotDescription:
             groups=groups,
             torso=torso,
             imu_site=read_imu_site(table, model),
-            feet=read_feet(table, model),
+            feet=feet,
             floating=model.floating is not None,
             poses=read_poses(table, joints),
             knobs=read_knobs(table, parameters, model),
             parameters=parameters,
+            terms=read_terms(table, joints, groups, feet, model),
             gait=read_gait(table, joints),
             network=read_network(table, parameters),
             timestep=read_timestep(table),

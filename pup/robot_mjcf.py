@@ -1,5 +1,6 @@
 """The names in an MJCF file, read without a simulator and without trusting the file."""
 
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ class MjcfNames:
       sites: named sites.
       floating: the body that carries the free joint; None for a fixed base.
       texts: the XML files read, the model first, then its includes.
+      files: the includes and assets that are there, relative to the model's folder.
     """
 
     joints: tuple[str, ...]
@@ -31,6 +33,7 @@ class MjcfNames:
     sites: frozenset[str]
     floating: str | None
     texts: tuple[str, ...]
+    files: frozenset[Path]
 
 
 def read_mjcf(path: Path) -> MjcfNames:
@@ -42,8 +45,7 @@ def read_mjcf(path: Path) -> MjcfNames:
     """
     texts: list[str] = []
     root = _parse(path, texts)
-    _splice_includes(root, path, texts)
-    _check_files(root, path)
+    files = {*_splice_includes(root, path, texts), *_assets(root, path)}
     joints: list[str] = []
     floating: list[str] = []
     names: dict[str, set[str]] = {"body": set(), "geom": set(), "site": set()}
@@ -72,6 +74,7 @@ def read_mjcf(path: Path) -> MjcfNames:
         sites=frozenset(names["site"]),
         floating=floating[0] if floating else None,
         texts=tuple(texts),
+        files=frozenset(files),
     )
 
 
@@ -98,17 +101,17 @@ def _parse(path: Path, texts: list[str]) -> ElementTree.Element:
 
 
 def _inside(model: Path, file: str) -> Path:
-    """The path of a file named in a model, which must lie in the model's folder."""
+    """A file named in a model, relative to the model's folder, in which it must lie."""
     folder = model.parent.resolve()
-    target = (folder / file).resolve()
-    if not target.is_relative_to(folder):
+    place = Path(os.path.normpath(folder / file))
+    if not (place.is_relative_to(folder) and (folder / file).resolve().is_relative_to(folder)):
         raise InputError(f"{model}: file {file!r} lies outside the robot's folder; copy it there")
-    return target
+    return place.relative_to(folder)
 
 
-def _splice_includes(root: ElementTree.Element, model: Path, texts: list[str]) -> None:
+def _splice_includes(root: ElementTree.Element, model: Path, texts: list[str]) -> set[Path]:
     """Replace every <include> by the children of the file it names, as MuJoCo does."""
-    seen = {model.resolve()}
+    seen = {Path(model.name)}
     waiting = [root]
     while waiting:
         element = waiting.pop()
@@ -123,11 +126,12 @@ def _splice_includes(root: ElementTree.Element, model: Path, texts: list[str]) -
             if file in seen:
                 raise InputError(f"{model}: includes {file.name!r} twice; include each file once")
             seen.add(file)
-            element[position : position + 1] = list(_parse(file, texts))
+            element[position : position + 1] = list(_parse(model.parent / file, texts))
+    return seen - {Path(model.name)}
 
 
-def _check_files(root: ElementTree.Element, model: Path) -> None:
-    """Refuse meshes, textures and other files outside the model's folder."""
+def _assets(root: ElementTree.Element, model: Path) -> Iterator[Path]:
+    """Meshes, textures and other files that are there; none may lie outside the model's folder."""
     folders = {key: "" for key in FOLDER_KEYS}
     for compiler in root.iter("compiler"):
         folders.update({key: compiler.get(key, folders[key]) for key in FOLDER_KEYS})
@@ -135,7 +139,9 @@ def _check_files(root: ElementTree.Element, model: Path) -> None:
         for attribute, file in element.items():
             if attribute.startswith("file"):
                 for folder in ("", *folders.values()):
-                    _inside(model, f"{folder}/{file}" if folder else file)
+                    named = _inside(model, f"{folder}/{file}" if folder else file)
+                    if (model.parent / named).is_file():
+                        yield named
 
 
 def _world(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:

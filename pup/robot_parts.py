@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Actuator = Literal["nn_pd", "pd"]
+PlaceKind = Literal["joint", "group", "body", "foot", "ground", "sensor", "bus", "robot"]
+SINGLE_KINDS: tuple[PlaceKind, ...] = ("ground", "sensor", "bus", "robot")
+"""Kinds of places of which a robot has one, without a name."""
 NETWORK_WEIGHTS = 27  # W1 2x5, b1 5, W2 5x2, b2 2; matrices row by row
 
 
@@ -99,6 +102,23 @@ class ParameterSpec:
     nominal: float
     search: tuple[float, float]
     actuators: tuple[Actuator, ...]
+
+
+@dataclass(frozen=True)
+class TermSpec:
+    """An effect beside the nominal model, at one place of the robot.
+
+    Attributes:
+      effect: such as `backlash`; the physics knows which there are, and their quantities.
+      kind: of the place.
+      name: of the joint, group, body or foot; empty for a kind of which there is one.
+      values: by quantity, in the physics' units; a size left out is zero.
+    """
+
+    effect: str
+    kind: PlaceKind
+    name: str
+    values: dict[str, float]
 
 
 class Harmonics(NamedTuple):

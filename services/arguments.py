@@ -27,6 +27,8 @@ def parser() -> argparse.ArgumentParser:
         ("record", "record scripted motions of a virtual robot", _record),
         ("presysid", "fit a robot's parameters to recordings, with bounds", _presysid),
         ("replay", "simulate recordings and compare", _replay),
+        ("diagnose", "say what physics the simulator leaves out, and model it", _diagnose),
+        ("blind", "make or score a sealed set of concealed cases", _blind),
     ):
         verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
         fill(verb)
@@ -69,6 +71,14 @@ def _replay(verb: argparse.ArgumentParser) -> None:
     )
     _out(verb, "replay.json and a plot per recording")
     _cores(verb)
+
+
+def _diagnose(verb: argparse.ArgumentParser) -> None:
+    _recordings(verb)
+    _robot(verb, required=True)
+    _out(verb, "diagnosis.json, report.html and corrected/, a robot with what was missing")
+    _seed(verb)
+    _place(verb)
 
 
 def _import(verb: argparse.ArgumentParser) -> None:
@@ -123,6 +133,43 @@ def _record(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--truth", type=Path, metavar="FILE", help="reveal the robot's parameters in this file"
     )
+
+
+def _blind(verb: argparse.ArgumentParser) -> None:
+    actions = verb.add_subparsers(title="actions", required=True, dest="action", metavar="ACTION")
+    make = actions.add_parser("make", help="make a set", description="Make a sealed set.")
+    for option, told in (("--robot", "with something missing"), ("--nulls", "without")):
+        make.add_argument(
+            option,
+            type=_count,
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar="NAME=COUNT",
+            help=f"cases {told}, by robot",
+        )
+    make.add_argument(
+        "--seed", required=True, metavar="KEY", help="any text; it tells the key, so conceal it"
+    )
+    _out(make, "the cases and commitment.json; it may hold nothing else")
+    make.add_argument(
+        "--key", type=Path, required=True, metavar="FILE", help="where the truth goes; conceal it"
+    )
+    score = actions.add_parser("score", help="score verdicts", description="Score verdicts.")
+    for option, metavar, told in (
+        ("--set", "DIR", "folder of the set"),
+        ("--key", "FILE", "its key, revealed"),
+        ("--diagnoses", "DIR", "folder with a folder case_<id> per case that holds diagnosis.json"),
+        ("--out", "FILE", "where the scores go, as JSON; a table goes beside it"),
+    ):
+        score.add_argument(option, type=Path, required=True, metavar=metavar, help=told)
+    for action in (make, score):
+        action.add_argument(
+            "--json",
+            action="store_true",
+            default=argparse.SUPPRESS,
+            help="print one JSON object last on standard output",
+        )
 
 
 def _recordings(verb: argparse.ArgumentParser) -> None:
@@ -241,3 +288,11 @@ def _knob(text: str) -> tuple[str, float]:
     if not name:
         raise argparse.ArgumentTypeError(f"{text!r} is not KNOB=NUMBER")
     return name, number
+
+
+def _count(text: str) -> tuple[str, int]:
+    """An argument type: how many cases of a robot."""
+    name, _, value = text.rpartition("=")
+    if not name or not value.isdecimal() or not 0 <= int(value) <= 10_000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=COUNT, with 0 to 10000 cases")
+    return name, int(value)

@@ -102,6 +102,17 @@ def _replay(options: argparse.Namespace) -> dict[str, Any]:
         return replay(robot, recordings, options.bounds, out, _cores(options))
 
 
+def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
+    from pup.recording import load_recordings
+    from services.diagnosis import run_diagnosis
+    from services.progress import stages
+
+    robot = RobotDescription.load(options.robot)
+    recordings = load_recordings(options.recordings, robot)
+    with _folder(options.out) as out, _replays(options) as (runner, lanes), stages() as progress:
+        return run_diagnosis(robot, recordings, out, runner, lanes, progress, options.seed)
+
+
 def _import(options: argparse.Namespace) -> dict[str, Any]:
     from pup.importers import ImportOptions, import_recordings
     from pup.recording import write_recordings
@@ -150,6 +161,13 @@ def _record(options: argparse.Namespace) -> dict[str, Any]:
     return {"recordings": [str(out / f"{r.id}.parquet") for r in made]}
 
 
+def _blind(options: argparse.Namespace) -> dict[str, Any]:
+    from services import blind
+
+    with _folder(blind.folder_of(options)):
+        return blind.make(options) if options.action == "make" else blind.score(options)
+
+
 @contextmanager
 def _runner(options: argparse.Namespace) -> Iterator[Any]:
     """Where fits run: this process, an embedded Ray or a cluster."""
@@ -162,6 +180,22 @@ def _runner(options: argparse.Namespace) -> Iterator[Any]:
 
     with connected(options.address, options.cores):
         yield RayRunner()
+
+
+@contextmanager
+def _replays(options: argparse.Namespace) -> Iterator[tuple[Any, int]]:
+    """Where batches of replays run, and how many at once."""
+    if options.local:
+        from pup.diagnosis.replays import Bench, threads
+
+        cores = _cores(options)
+        yield lambda measured: threads(Bench(measured), cores), cores
+        return
+    from workers.cluster import connected
+    from workers.hypotheses import lanes, ray_runner
+
+    with connected(options.address, options.cores):
+        yield ray_runner, lanes()
 
 
 def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
@@ -232,6 +266,18 @@ def _show_replay(shown: dict[str, Any]) -> None:
     replay_table(shown)
 
 
+def _show_blind(shown: dict[str, Any]) -> None:
+    from services.blind import show
+
+    show(shown)
+
+
+def _show_diagnosis(shown: dict[str, Any]) -> None:
+    from services.tables import diagnosis_table
+
+    diagnosis_table(shown)
+
+
 def _show_recordings(shown: dict[str, Any]) -> None:
     for path in shown["recordings"]:
         print(path)
@@ -243,6 +289,8 @@ VERBS = {
     "record": (_record, _show_recordings),
     "presysid": (_presysid, _show_bounds),
     "replay": (_replay, _show_replay),
+    "diagnose": (_diagnose, _show_diagnosis),
+    "blind": (_blind, _show_blind),
 }
 """What each verb does and how its outcome is shown."""
 

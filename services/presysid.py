@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
+from pup.physics.terms import split_column
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
 from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range
@@ -118,7 +119,7 @@ class _Job:
         bounded = replace(
             main,
             space=main.space.at(dict(zip(main.space.names, best, strict=True))),
-            free=tuple(n for n in main.space.names if n not in NETWORK_NAMES),
+            free=tuple(n for n in _movable(main.space) if n not in NETWORK_NAMES),
         )
         subsets = self._subsets(bounded)
         bounds = self._bounds(bounded, fitted, full, subsets, begin)
@@ -139,7 +140,7 @@ class _Job:
         """All recordings, with the parameters free that they can see."""
         space = robot_space(self.robot, actuator)
         free = tuple(
-            n for n in space.names if not (self.options.fixed_network and n in NETWORK_NAMES)
+            n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
         )
         problem = Problem(self.robot, self.recordings, actuator, space, free, self.threads)
         start = problem.free_space.normalise(problem.free_space.nominal)
@@ -284,6 +285,11 @@ class _Job:
             "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
             "seconds": round(seconds, 1),
         }
+
+
+def _movable(space: ParameterSpace) -> list[str]:
+    """The parameters of the nominal model; the description's terms stay as they are."""
+    return [name for name in space.names if split_column(name) is None]
 
 
 def _short(*parts: object) -> str:

@@ -3,7 +3,7 @@
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -32,6 +32,18 @@ def reporter() -> Iterator[Reporter]:
         return
     with Live(console=Console(stderr=True), refresh_per_second=4, transient=True) as live:
         yield _Table(live)
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str, float], None]]:
+    """Told a job's stage and the share of it that is done; a line for each on standard error."""
+    begin = time.monotonic()
+
+    def tell(stage: str, share: float) -> None:
+        spent = _duration(time.monotonic() - begin)
+        print(f"{stage}: {share:.0%} after {spent}", file=sys.stderr, flush=True)
+
+    yield tell
 
 
 class _Clock:

@@ -45,3 +45,32 @@ def replay_table(document: dict[str, Any]) -> None:
     table.add_row("all", f"{document['rmse']:.3g}")
     console.print(table)
     console.print(f"model: {document['actuator']}, {document['model']}", soft_wrap=True)
+
+
+def diagnosis_table(document: dict[str, Any]) -> None:
+    """Print the verdict and the findings of a `diagnosis.json` document."""
+    console = Console(highlight=False)
+    console.print(f"{document['robot']}: {document['verdict']}", style="bold")
+    if document["reason"]:
+        console.print(document["reason"], soft_wrap=True)
+    if document["findings"]:
+        table = Table(title_justify="left")
+        for column in ("effect", "place", "probability", "or", "hidden in"):
+            table.add_column(column, justify="right" if column == "probability" else "left")
+        for found in document["findings"]:
+            others = ", ".join(
+                f"{o['effect']} ({o['probability']:.0%})" for o in found["equivalents"]
+            )
+            hidden = ", ".join(f"{n} {s:+.0%}" for n, s in list(found["absorbed_by"].items())[:2])
+            place = f"{found['place']['kind']} {', '.join(found['place']['names'])}"
+            table.add_row(found["effect"], place, f"{found['probability']:.0%}", others, hidden)
+        console.print(table)
+    held = document["held_out"]
+    if held:
+        before, after = (1e3 * held[f"rmse_{when}"] for when in ("before", "after"))
+        floor = document["noise_floor"]
+        console.print(
+            f"on motions left out: {before:.2f} mrad before, {after:.2f} mrad after; "
+            f"noise floor {1e3 * floor['rms']:.2f} mrad ({floor['source']})",
+            soft_wrap=True,
+        )

@@ -127,22 +127,6 @@ class NetworkPD:
         return torque, damping
 
 
-def implicit_share(damping: Array, inertia: Array, timestep: float) -> Array:
-    """Share of a viscous torque to be taken implicitly, for one inertia exact whatever the step.
-
-    Of `inertia * dv/dt = -damping * v` a step that takes the share 1/(1 - exp(-x)) - 1/x, with
-    x = damping * timestep / inertia, implicitly and the rest explicitly ends at exp(-x) v: half of
-    it where damping is soft (second order), all of it where it is stiff (stable).
-
-    Args:
-      damping: viscous coefficients, N m s/rad.
-      inertia: what they brake, same shape, kg m².
-      timestep: s.
-    """
-    x = np.maximum(damping * (timestep / inertia), 1e-6)
-    return np.asarray(-1 / np.expm1(-x) - 1 / x)
-
-
 def per_joint(robot: RobotDescription, candidates: Candidates, kind: str) -> Array:
     """A parameter given per group, spread to the joints: shape (n_simulations, n_joints)."""
     try:

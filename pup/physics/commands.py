@@ -42,13 +42,14 @@ class Commands:
 
     def __init__(self, plans: Sequence[Schedule], timestep: float) -> None:
         self.timestep = timestep
-        ticks = max(len(p.time) for p in plans)
+        told = [_changes(plan) for plan in plans]
+        ticks = max(len(time) for time, _ in told)
         self.time = np.full((len(plans), ticks + 1), np.inf)
         self.held = np.empty((len(plans), ticks + 1, plans[0].held.shape[1]))
-        for row, plan in enumerate(plans):
-            self.time[row, : len(plan.time)] = plan.time
-            self.held[row, : len(plan.held)] = plan.held
-            self.held[row, len(plan.held) :] = plan.held[-1]
+        for row, (time, held) in enumerate(told):
+            self.time[row, : len(time)] = time
+            self.held[row, : len(held)] = held
+            self.held[row, len(held) :] = held[-1]
         self.steps = max(p.steps for p in plans)
         self._cells = np.arange(self.steps + 1) * timestep
         self._last = np.stack(
@@ -98,6 +99,12 @@ class Commands:
         row = row + (self.time[recordings, row + 1] <= time)
         joints = np.arange(self.held.shape[2])
         return self.held[recordings, row, joints], row
+
+
+def _changes(plan: Schedule) -> tuple[Array, Array]:
+    """The ticks that tell something new, with what they tell."""
+    new = np.append(True, (np.diff(plan.held, axis=0) != 0).any(axis=1))
+    return plan.time[new], plan.held[new]
 
 
 _ONE = np.ones(())

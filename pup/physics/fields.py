@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pup.errors import InputError
 from pup.physics.model import Model
 from pup.physics.parameters import Candidates
+from pup.physics.terms import split_column
 from pup.physics.writer import FieldWriter
 from pup.robot import RobotDescription
 
@@ -92,8 +93,8 @@ def _apply(
 ) -> None:
     """Write one parameter; those of the torque law, which it reads itself, pass."""
     kind, _, place = name.partition("/")
-    if "@" in name:
-        return  # an effect beside the nominal model, see `terms`
+    if split_column(name) is not None:
+        return  # an effect beside the nominal model
     if kind == "torso_com" and robot.torso:
         writer.element("body_ipos", robot.torso)[:, _AXES.index(place)] += values
     elif kind == "com":

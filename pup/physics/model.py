@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.physics.rotations import CONJUGATE, multiply
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
@@ -129,14 +130,39 @@ def starting_qpos(
 ) -> Array:
     """The configuration a recording starts in, shape (nq,).
 
-    On the ground the torso takes the IMU's first roll and pitch, or where there is none the tilt
-    that lays the feet flat, and the lowest point of the robot touches the floor.
-
     Args:
       robot: the robot.
       model: its compiled model.
       position: the joints' first positions, shape (n_joints,), rad.
       recording: gives the IMU's first reading.
+    """
+    return standing_qpos(robot, model, position, first_tilt(robot, model, recording))
+
+
+def first_tilt(robot: RobotDescription, model: Model, recording: Recording) -> Array:
+    """The torso's orientation by the IMU's first roll and pitch, shape (4,); NaN without them."""
+    roll, pitch = (
+        _first_known(recording.extras.get(f"imu/{angle}")) for angle in ("roll", "pitch")
+    )
+    if roll is None or pitch is None:
+        return np.full(4, np.nan)
+    quaternion = _from_roll_pitch(roll, pitch)
+    if robot.imu_site is not None:
+        quaternion = multiply(quaternion, model.compiled.site(robot.imu_site).quat * CONJUGATE)
+    return quaternion
+
+
+def standing_qpos(robot: RobotDescription, model: Model, position: Array, torso: Array) -> Array:
+    """A configuration to start in, shape (nq,).
+
+    On the ground the torso takes an orientation, or where there is none the tilt that lays the
+    feet flat, and the lowest point of the robot touches the floor.
+
+    Args:
+      robot: the robot.
+      model: its compiled model.
+      position: of the joints, shape (n_joints,), rad.
+      torso: quaternion, shape (4,); NaN for none.
     """
     data = mujoco.MjData(model.compiled)
     data.qpos[model.qpos] = position
@@ -144,17 +170,7 @@ def starting_qpos(
         return np.array(data.qpos)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model.compiled, data)
-    roll, pitch = (
-        _first_known(recording.extras.get(f"imu/{angle}")) for angle in ("roll", "pitch")
-    )
-    if roll is None or pitch is None:
-        quaternion = _feet_flat(robot, model.compiled, data)
-    else:
-        quaternion = _from_roll_pitch(roll, pitch)
-        if robot.imu_site is not None:
-            mount = model.compiled.site(robot.imu_site).quat
-            mujoco.mju_mulQuat(quaternion, quaternion.copy(), mount * (1, -1, -1, -1))
-    data.qpos[3:7] = quaternion
+    data.qpos[3:7] = _feet_flat(robot, model.compiled, data) if np.isnan(torso).any() else torso
     mujoco.mj_kinematics(model.compiled, data)
     data.qpos[2] -= _lowest_point(model.compiled, data)
     return np.array(data.qpos)

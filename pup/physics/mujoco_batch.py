@@ -15,12 +15,13 @@ from pup.physics.actuators import LAWS, TorqueLaw
 from pup.physics.commands import Commands
 from pup.physics.encoders import Event, History
 from pup.physics.fields import apply_fields, scaled
-from pup.physics.model import Model, compile_model, starting_qpos
+from pup.physics.model import Model, compile_model, first_tilt, standing_qpos
 from pup.physics.parameters import Candidates
+from pup.physics.push import Push, Pushing
 from pup.physics.rotations import multiply, roll_pitch
 from pup.physics.servo import Servos
 from pup.physics.simulator import Schedule, Trajectories, schedule, tick_slices
-from pup.physics.terms import Scene, Term, bind_terms
+from pup.physics.terms import Drivetrain, Scene, Term, bind_terms
 from pup.physics.writer import FieldWriter
 from pup.recording import Recording
 from pup.robot import RobotDescription
@@ -42,9 +43,11 @@ class _Group:
     """Recordings of one support, longest first, so that those still running are the first ones.
 
     Attributes:
+      members: which recordings.
       model: the compiled model.
       setups: the setup knobs of each recording.
       start: starting qpos of each, shape (n_recordings, nq).
+      torso: first orientations by the IMU, shape (n_recordings, 4); NaN where there is none.
       start_velocity: starting joint velocities, shape (n_recordings, n_joints).
       commands: their targets.
       power: share of torque on, shape (n_steps, n_recordings).
@@ -52,9 +55,11 @@ class _Group:
       events: the ticks in each sub-step.
     """
 
+    members: tuple[int, ...]
     model: Model
     setups: tuple[dict[str, float], ...]
     start: Array
+    torso: Array
     start_velocity: Array
     commands: Commands
     power: Array
@@ -102,8 +107,8 @@ class MujocoSimulator:
         """Sub-steps that one candidate costs."""
         return int(sum(group.running.sum() for group in self.groups))
 
-    def replay(self, candidates: Candidates) -> Trajectories:
-        """See Simulator."""
+    def replay(self, candidates: Candidates, push: Push | None = None) -> Trajectories:
+        """See Simulator; `push` adds torques from outside."""
         n, ticks = len(candidates), self.ticks[-1].stop if self.ticks else 0
         out = Trajectories(
             self.ticks,
@@ -115,7 +120,8 @@ class MujocoSimulator:
 
         def run(job: tuple[_Group, slice]) -> None:
             group, part = job
-            _Run(self.robot, group, candidates.rows(part), self.law).into(out, part)
+            pushed = None if push is None else push.of(part, group.members)
+            _Run(self.robot, group, candidates.rows(part), self.law, pushed).into(out, part)
 
         if self.threads == 1:
             for job in jobs:
@@ -143,13 +149,17 @@ class MujocoSimulator:
         ordered = [plans[i] for i in members]
         steps = ordered[0].steps
         power = np.stack([_extended(p.power, steps) for p in ordered], axis=1)
+        torso = [first_tilt(self.robot, model, self.recordings[i]) for i in members]
         start = [
-            starting_qpos(self.robot, model, plans[i].start, self.recordings[i]) for i in members
+            standing_qpos(self.robot, model, plans[i].start, tilt)
+            for i, tilt in zip(members, torso, strict=True)
         ]
         return _Group(
+            members=tuple(members),
             model=model,
             setups=tuple(self.robot.setup(self.recordings[i].setup) for i in members),
             start=np.stack(start),
+            torso=np.stack(torso),
             start_velocity=np.stack([p.start_velocity for p in ordered]),
             commands=Commands(ordered, self.robot.timestep),
             power=np.ascontiguousarray(power),
@@ -189,7 +199,9 @@ class _Run:
         group: _Group,
         candidates: Candidates,
         law: Callable[[RobotDescription, Candidates], TorqueLaw],
+        push: Push | None = None,
     ) -> None:
+        self.robot = robot
         self.group = group
         self.candidates = len(candidates)
         nsim = len(group.setups) * self.candidates
@@ -209,9 +221,10 @@ class _Run:
         self.servos = Servos(
             bound, group.commands, group.power, self.terms, scene, viscous, delay, self.candidates
         )
-        self._start(nsim)
+        self.push = None if push is None else Pushing(push, group.model, robot.timestep)
         self.ids = np.arange(nsim, dtype=np.int32)
         self.broken = np.zeros(nsim, dtype=bool)
+        self._start(nsim)
         age = _longest(self.terms, "delay", robot.timestep)
         self.joints = History(nsim, len(robot.joints), age)
         self.feet = [group.model.compiled.body(foot).id for foot in robot.feet]
@@ -223,10 +236,7 @@ class _Run:
     def _start(self, nsim: int) -> None:
         """Put the simulations where the recordings start."""
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        start = np.repeat(self.group.start, self.candidates, axis=0)
-        for term in self.terms:
-            term.start(start)
-        self.qpos[:] = start
+        self.qpos[:] = self._starting_qpos()
         velocity = np.repeat(self.group.start_velocity, self.candidates, axis=0)
         self.qvel[:, self.group.model.dofs] = velocity
         self.force, self.damping = self.batch.bind("qfrc_applied"), self.batch.expand("dof_damping")
@@ -242,9 +252,41 @@ class _Run:
         sensed = self.servos.sense(self.qpos[:, model.qpos], self.qvel[:, model.dofs])
         self._drive(0, nsim, sensed)
         self.batch.forward()
-        self.qvel -= self.batch.model.opt.timestep / 2 * acceleration
+        behind = self.batch.model.opt.timestep / 2 * acceleration
+        for term in self.terms:
+            if isinstance(term, Drivetrain):
+                behind[term.rows] = self._tried(term, sensed)
+        self.qvel -= behind
         for term in self.terms:
             term.prepare()
+
+    def _tried(self, train: Drivetrain, sensed: tuple[Array, Array]) -> Array:
+        """Half of the velocity that links gain in a first sub-step, which is then undone.
+
+        What a motor that reaches its link through play or give does at once depends on both.
+        """
+        model, rows = self.group.model, train.rows
+        position, velocity = self.qpos.copy(), self.qvel.copy()
+        self._drive(0, len(self.ids), sensed, still=True)
+        self._advance(rows)
+        train.tried(self.qpos[:, model.qpos], self.qvel[:, model.dofs], velocity[:, model.dofs])
+        gained = np.asarray((self.qvel - velocity)[rows] / 2)
+        self.qpos[:], self.qvel[:] = position, velocity
+        return gained
+
+    def _starting_qpos(self) -> Array:
+        """Where the simulations start; terms may say that it was not as it was read."""
+        group, model = self.group, self.group.model
+        qpos = np.repeat(group.start, self.candidates, axis=0)
+        position = qpos[:, model.qpos].copy()
+        torso = np.repeat(group.torso, self.candidates, axis=0)
+        read = np.hstack([position, torso])
+        for term in reversed(self.terms):
+            term.start(position, torso)
+        was = np.hstack([position, torso])
+        for row in np.flatnonzero(((was != read) & ~np.isnan(was)).any(axis=1)):
+            qpos[row] = standing_qpos(self.robot, model, position[row], torso[row])
+        return qpos
 
     def into(self, out: Trajectories, part: slice) -> None:
         """Run to the end and write the candidates' part of the trajectories."""
@@ -258,7 +300,7 @@ class _Run:
                 self._store(observed, out, part)
             n = int(running) * self.candidates
             self._drive(step, n, (sensed[0][:n], sensed[1][:n]))
-            self._advance(n)
+            self._advance(None if n == len(self.ids) else self.ids[:n])
             observed = event
             if event is not None and self.group.model.floating:
                 self._store_feet(event, out, part)
@@ -275,16 +317,19 @@ class _Run:
             self.torso.push(self.qpos[:n, 3:7])
         return sensed
 
-    def _drive(self, step: int, n: int, sensed: tuple[Array, Array]) -> None:
-        """Apply what reaches the links in one sub-step."""
+    def _drive(self, step: int, n: int, sensed: tuple[Array, Array], still: bool = False) -> None:
+        """Apply what reaches the links in one sub-step; see Servos.torque."""
         qpos, dofs = self.group.model.qpos, self.group.model.dofs
         link = self.qpos[:n, qpos], self.qvel[:n, dofs]
         bias = None if self.bias is None else self.bias[:n, dofs]
-        self.force[:n, dofs], self.damping[:n, dofs] = self.servos.torque(step, link, sensed, bias)
+        told = self.servos.torque(step, link, sensed, bias, still)
+        self.force[:n, dofs], self.damping[:n, dofs] = told
+        if self.push is not None:
+            self.push.add(self.force, step, n)
 
-    def _advance(self, n: int) -> None:
+    def _advance(self, ids: NDArray[np.int32] | None) -> None:
         try:
-            self.batch.step(ids=None if n == len(self.ids) else self.ids[:n])
+            self.batch.step(ids=ids)
         except mujoco.batch.SimulationError as error:
             self.broken[error.ids] = True
             self.batch.reset(ids=error.ids)
@@ -326,7 +371,7 @@ def _write(to: Array, part: slice, event: Event, values: Array) -> None:
 def _scene(robot: RobotDescription, model: Model, law: TorqueLaw, shape: tuple[int, ...]) -> Scene:
     """What the terms of a batch know of their simulations."""
     own = model.compiled.dof_armature[model.dofs]
-    armature = np.broadcast_to(own if law.armature is None else law.armature, shape)
+    armature = np.broadcast_to(own if law.armature is None else law.armature, shape).copy()
     inertia = model.compiled.dof_M0[model.dofs] - own + armature
     return Scene(robot, model, robot.timestep, inertia, armature, np.broadcast_to(law.limit, shape))
 

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.actuators import TorqueLaw, implicit_share
+from pup.physics.actuators import TorqueLaw
 from pup.physics.commands import Commands, Target
+from pup.physics.implicit import implicit_share
 from pup.physics.terms.base import Drive, Flow, Scene, Term
 
 Array = NDArray[np.float64]
@@ -58,6 +59,7 @@ class Servos:
         self.late, self.commanding, self.sensing = of("lateness"), of("command"), of("sense")
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
+        self._before: Array | None = None
         self.loaded = any(term.loaded for term in self.flowing)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
@@ -67,7 +69,12 @@ class Servos:
         return position, velocity
 
     def torque(
-        self, step: int, link: tuple[Array, Array], sensed: tuple[Array, Array], bias: Array | None
+        self,
+        step: int,
+        link: tuple[Array, Array],
+        sensed: tuple[Array, Array],
+        bias: Array | None,
+        still: bool = False,
     ) -> tuple[Array, Array]:
         """What reaches the links in one sub-step.
 
@@ -76,6 +83,7 @@ class Servos:
           link: positions (rad) and velocities (rad/s) of the links, each (n_active, n_joints).
           sensed: the same as the encoders tell them.
           bias: torques of gravity and motion, same shape, N m; None where no term asks for them.
+          still: damp by the velocities that are, not by those at the sub-step's end.
 
         Returns:
           The applied torque (N m) and the viscous coefficient (N m s/rad), both of that shape.
@@ -97,20 +105,26 @@ class Servos:
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
         viscous = self.viscous[: len(damping)]
-        if self.law.steady:
-            share = implicit_share(
-                damping + viscous, self.scene.inertia[: len(damping)], self.scene.timestep
-            )
+        brake = np.zeros_like(torque)
+        if self.law.steady or still:
+            share = np.zeros_like(torque)
+            if not still:
+                share = implicit_share(
+                    damping + viscous, self.scene.inertia[: len(damping)], self.scene.timestep
+                )
             torque -= (1 - share) * (damping * sensed[1])
             damping *= share
+            brake = (1 - share) * (viscous * sensed[1])
+            viscous = share * viscous
         if self.flowing:
-            flow = Flow(time, *link, bias, torque, damping)
+            now = link[1]
+            before = now if step == 0 or self._before is None else self._before[: len(now)]
+            self._before = now.copy()
+            flow = Flow(time, *link, 2 * now - before, bias, torque, damping, brake, viscous)
             for term in self.flowing:
                 term.flow(flow)
-            torque, damping = flow.torque, flow.damping
-        if self.law.steady:
-            torque -= (1 - share) * (viscous * link[1])
-            viscous = share * viscous
+            torque, damping, brake, viscous = flow.torque, flow.damping, flow.brake, flow.viscous
+        torque -= brake
         damping += viscous
         return torque, damping
 
@@ -127,9 +141,10 @@ class Servos:
         if self.commanding:
             now = self._spread(target.now, running)
             before = now if target.before is None else self._spread(target.before, running)
+            share = self._spread(target.share, running)
             for term in self.commanding:
-                now, before = term.command(now, before)
-            target = Target(now, None if target.before is None else before, target.share)
+                now, before = term.command(now, before, share)
+            target = Target(now, None if target.before is None else before, share)
         return target
 
     def _spread(self, values: Array, running: int) -> Array:
@@ -157,10 +172,10 @@ class Servos:
             _clip(torque, damping, velocity, limit)
             return error, torque, damping
         upper = np.broadcast_to(limit, error.shape).copy()
-        drive = Drive(time, error, velocity, torque, upper, -upper)
+        drive = Drive(time, error, velocity, torque, upper, -upper, np.zeros_like(upper))
         for term in self.driving:
             term.drive(drive)
-        _clip_between(drive.torque, damping, velocity, drive.lower, drive.upper)
+        _clip_between(drive, damping)
         return error, drive.torque, damping
 
 
@@ -172,12 +187,12 @@ def _clip(torque: Array, damping: Array, velocity: Array, limit: Array) -> None:
     np.copyto(damping, 0.0, where=clipped)
 
 
-def _clip_between(
-    torque: Array, damping: Array, velocity: Array, lower: Array, upper: Array
-) -> None:
-    """The same between two limits of their own."""
-    total = torque - damping * velocity
-    above, below = ~(total < upper), ~(total > lower)
-    np.copyto(torque, upper, where=above)
-    np.copyto(torque, lower, where=below)
-    np.copyto(damping, 0.0, where=above | below)
+def _clip_between(drive: Drive, damping: Array) -> None:
+    """The same between two limits of their own; what falls with speed at a limit damps there."""
+    total = drive.torque - damping * drive.velocity
+    above, below = ~(total < drive.upper), ~(total > drive.lower)
+    for limit, beyond in ((drive.upper, above), (drive.lower, below)):
+        falls = (limit != 0) & (limit * drive.velocity >= 0)
+        slope = np.where(falls, drive.slope, 0.0)
+        np.copyto(drive.torque, limit + slope * drive.velocity, where=beyond)
+        np.copyto(damping, slope, where=beyond)

@@ -16,6 +16,7 @@ from pup.files import write_json
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.simulator import Trajectories
+from pup.physics.terms import split_column
 from pup.recording import Recording, write_recordings
 from pup.robot import RobotDescription
 from pup.sysid.excitation import Motion, joint_units, script
@@ -71,7 +72,8 @@ def concealed_parameters(
 ) -> dict[str, float]:
     """Draw what a virtual robot is like, uniformly within reason and inside the search ranges.
 
-    Network weights stay as they are: they shape one servo type, which all draws share.
+    Network weights stay as they are: they shape one servo type, which all draws share. So do the
+    terms of the robot's description.
 
     Args:
       robot: the robot.
@@ -97,7 +99,7 @@ def concealed_parameters(
 def _reasonable(name: str, nominal: float, lower: float, upper: float) -> tuple[float, float]:
     """Range to draw a parameter from, not yet cut to its search range."""
     kind = name.partition("/")[0]
-    if name in NETWORK_NAMES:
+    if name in NETWORK_NAMES or split_column(name) is not None:
         return nominal, nominal
     if kind in GAINS:
         return GAIN_SPREAD[0] * nominal, GAIN_SPREAD[1] * nominal

@@ -5,14 +5,14 @@ word anywhere: a space without such columns is the nominal model.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.physics.parameters import Candidates, ParameterSpace
+from pup.physics.space import Candidates, ParameterSpace
 from pup.physics.terms.actuator import (
     ActuatorLag,
     Cogging,
@@ -49,8 +49,16 @@ from pup.physics.terms.sensing import (
     MeasurementDelay,
 )
 from pup.physics.terms.timing import ClockSkew, CommandDelay
-from pup.physics.terms.transmission import Backlash, JointCompliance, JointSpring, JointStop
-from pup.robot import RobotDescription
+from pup.physics.terms.transmission import (
+    Backlash,
+    Drivetrain,
+    JointCompliance,
+    JointSpring,
+    JointStop,
+    Transmission,
+)
+from pup.robot import RobotDescription, TermSpec
+from pup.robot_parts import SINGLE_KINDS
 
 Array = NDArray[np.float64]
 
@@ -69,19 +77,19 @@ TERMS: dict[str, type[Term]] = {
         TorqueSpeedLimit,
         ActuatorLag,
         GearEfficiency,
+        Armature,
         Backlash,
         JointCompliance,
         StructuralFlex,
+        LoadDependentFriction,
         CoulombFriction,
         StribeckFriction,
         PreslidingHysteresis,
-        LoadDependentFriction,
         FrictionAsymmetry,
         QuadraticDamping,
         Cogging,
         JointSpring,
         JointStop,
-        Armature,
         Payload,
         ComOffset,
         ExternalForce,
@@ -159,11 +167,25 @@ def split_column(name: str) -> tuple[str, str, Place] | None:
     if not at:
         return None
     effect, _, quantity = head.partition("/")
-    if effect not in TERMS:
-        raise InputError(f"{name!r}: there is no effect {effect!r}; known: {', '.join(TERMS)}")
-    if quantity not in [q.name for q in TERMS[effect].quantities]:
-        raise InputError(f"{name!r}: {effect} has no {quantity!r}")
+    try:
+        _quantity(_term(effect), quantity)
+    except InputError as error:
+        raise InputError(f"{name!r}: {error}") from error
     return effect, quantity, Place.parse(place)
+
+
+def _term(effect: str) -> type[Term]:
+    if effect not in TERMS:
+        raise InputError(f"there is no effect {effect!r}; known: {', '.join(TERMS)}")
+    return TERMS[effect]
+
+
+def _quantity(term: type[Term], name: str) -> Quantity:
+    for quantity in term.quantities:
+        if quantity.name == name:
+            return quantity
+    known = ", ".join(q.name for q in term.quantities)
+    raise InputError(f"{term.effect} has no {name!r}; it has: {known}")
 
 
 def term_space(effect: str, place: Place) -> ParameterSpace:
@@ -175,6 +197,30 @@ def term_space(effect: str, place: Place) -> ParameterSpace:
         np.array([q.nominal for q in quantities]),
         np.array([q.lower for q in quantities]),
         np.array([q.limit for q in quantities]),
+    )
+
+
+def described(spec: TermSpec) -> ParameterSpace:
+    """The parameters of a term of a robot's description, nominally as given there.
+
+    The search ranges are those of the effect, wide enough for what is given.
+
+    Raises:
+      InputError: no such effect or quantity, a place it cannot act at, or a negative size.
+    """
+    term = _term(spec.effect)
+    place = Place.parse(f"{spec.kind}:{spec.name}" if spec.name else spec.kind)
+    _check_kind(term, place)
+    for name, value in spec.values.items():
+        quantity = _quantity(term, name)
+        if value < 0 and not quantity.signed:
+            raise InputError(f"{name} = {value:g}: {spec.effect} takes no negative {name}")
+    space = term_space(spec.effect, place)
+    given = space.at({column(spec.effect, name, place): v for name, v in spec.values.items()})
+    return replace(
+        given,
+        lower=np.minimum(given.lower, given.nominal),
+        upper=np.maximum(given.upper, given.nominal),
     )
 
 
@@ -190,13 +236,16 @@ def bind_terms(candidates: Candidates, scene: Scene) -> list[Term]:
         told = split_column(name)
         if told is not None and (scene.model.floating or told[2].kind not in ("ground", "foot")):
             named.setdefault(told[0], []).append((name, told[1], told[2]))
-    bound = []
+    bound: list[Term] = []
     for effect, term in TERMS.items():
         columns = named.get(effect, [])
         sizes = {q.name for q in term.magnitudes()}
         if any(candidates[name].any() for name, quantity, _ in columns if quantity in sizes):
             bound.append(term(_values(term, columns, candidates, scene), scene))
-    return bound
+    parts = [term for term in bound if isinstance(term, Transmission)]
+    if parts:
+        bound[bound.index(parts[0])] = Drivetrain(parts, scene)
+    return [term for term in bound if not isinstance(term, Transmission)]
 
 
 def _values(
@@ -240,12 +289,7 @@ def _width(term: type[Term], scene: Scene) -> int:
 def _where(term: type[Term], place: Place, scene: Scene) -> NDArray[np.int64]:
     """The columns of a term's layout that a place covers."""
     robot = scene.robot
-    if place.kind not in term.kinds:
-        raise InputError(
-            f"{term.effect} cannot act at {place}; it acts at a {' or '.join(term.kinds)}"
-        )
-    if place.kind in ("bus", "robot", "sensor", "ground") and place.name:
-        raise InputError(f"place {place}: there is one {place.kind}; leave the name out")
+    _check_kind(term, place)
     names = _names(place.kind, robot, scene)
     if place.name and place.name not in names:
         raise InputError(f"place {place}: the robot has no {place.kind} of that name")
@@ -261,15 +305,27 @@ def _where(term: type[Term], place: Place, scene: Scene) -> NDArray[np.int64]:
         body = scene.model.compiled.body(place.name)
         if term.layout == "bodies":
             return np.array([body.id])
-        return np.array(
-            [
-                i
-                for i, name in enumerate(robot.joint_names)
-                if scene.model.compiled.joint(name).bodyid[0] == body.id
-            ],
-            dtype=np.int64,
-        )
+        carrying = [
+            i
+            for i, name in enumerate(robot.joint_names)
+            if scene.model.compiled.joint(name).bodyid[0] == body.id
+        ]
+        if not carrying:
+            raise InputError(f"place {place}: no joint carries it, so {term.effect} cannot act")
+        return np.array(carrying)
     return np.arange(_width(term, scene))
+
+
+def _check_kind(term: type[Term], place: Place) -> None:
+    """Refuse a place of a kind at which a term cannot act, or one too many or too few names."""
+    if place.kind not in term.kinds:
+        raise InputError(
+            f"{term.effect} cannot act at {place}; it acts at a {' or '.join(term.kinds)}"
+        )
+    if place.kind in SINGLE_KINDS and place.name:
+        raise InputError(f"place {place}: there is one {place.kind}; leave the name out")
+    if place.kind not in SINGLE_KINDS and not place.name:
+        raise InputError(f"place {place}: which {place.kind}? give its name")
 
 
 def _names(kind: Kind, robot: RobotDescription, scene: Scene) -> Sequence[str]:
@@ -289,6 +345,7 @@ __all__ = [
     "CLASSES",
     "CLASS_OF",
     "TERMS",
+    "Drivetrain",
     "Kind",
     "Place",
     "Quantity",
@@ -296,6 +353,7 @@ __all__ = [
     "Term",
     "bind_terms",
     "column",
+    "described",
     "split_column",
     "term_space",
 ]

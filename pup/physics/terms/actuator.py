@@ -29,11 +29,13 @@ class TorqueSpeedLimit(Term):
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        loss = self.values["slope"][: len(drive.torque)] * drive.velocity
+        slope = self.values["slope"][: len(drive.torque)]
+        loss = slope * drive.velocity
         drive.upper -= np.maximum(loss, 0.0)
         drive.lower -= np.minimum(loss, 0.0)
         np.maximum(drive.upper, 0.0, out=drive.upper)
         np.minimum(drive.lower, 0.0, out=drive.lower)
+        drive.slope += slope
 
 
 class ActuatorLag(Term):
@@ -45,23 +47,26 @@ class ActuatorLag(Term):
 
     def prepare(self) -> None:
         """See Term."""
-        self._share = -np.expm1(-self.scene.timestep / np.maximum(self.values["time"], 1e-9))
-        self._torque: Array | None = None
-        self._damping = np.zeros_like(self._share)
+        steps = self.scene.timestep / np.maximum(self.values["time"], 1e-9)
+        self._kept = np.exp(-steps)
+        self._share = 1 - (1 - self._kept) / steps
+        self._lagging: Array | None = None
+        self._asked = np.zeros_like(steps), np.zeros_like(steps)
 
     def flow(self, flow: Flow) -> None:
-        """See Term."""
+        """See Term: what is applied is the mean over the sub-step."""
         n = len(flow.torque)
-        share, lagging = self._share[:n], self.values["time"][:n] > 0
-        if self._torque is None:
-            self._torque = flow.torque - flow.damping * flow.velocity
+        torque, damping = (part[:n] for part in self._asked)
+        if self._lagging is None:
+            self._lagging = flow.torque - flow.damping * flow.velocity
         else:  # what the last sub-step came to, by the velocity at its end
-            self._torque[:n] -= self._damping[:n] * flow.velocity
-        torque = self._torque[:n]
-        torque += share * (flow.torque - torque)
-        self._damping[:n] = share * flow.damping
-        np.copyto(flow.torque, torque, where=lagging)
-        np.copyto(flow.damping, self._damping[:n], where=lagging)
+            asked = torque - damping * flow.velocity
+            self._lagging[:n] = asked + self._kept[:n] * (self._lagging[:n] - asked)
+        torque[:], damping[:] = flow.torque, flow.damping
+        active, share = self.values["time"][:n] > 0, self._share[:n]
+        lagging = self._lagging[:n]
+        np.copyto(flow.torque, lagging + share * (torque - lagging), where=active)
+        np.copyto(flow.damping, share * damping, where=active)
 
 
 class VoltageSag(Term):
@@ -134,7 +139,8 @@ class IntegralAction(Term):
     def drive(self, drive: Drive) -> None:
         """See Term."""
         n = len(drive.torque)
-        drive.torque += self.values["gain"][:n] * self._sum[:n]
+        now = self._sum[:n] + self.scene.timestep / 2 * drive.error
+        drive.torque += self.values["gain"][:n] * now
 
     def settle(self, error: Array, torque: Array) -> None:
         """See Term."""
@@ -171,15 +177,24 @@ class TargetRateLimit(Term):
         self._reach = self.scene.timestep / np.maximum(slowness, 1e-9)
         self._goal: Array | None = None
 
-    def command(self, now: Array, before: Array) -> tuple[Array, Array]:
+    def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term."""
         n = len(now)
         if self._goal is None:
             self._goal = before.copy()
-        goal = self._goal[:n]
-        goal += np.clip(now - goal, -self._reach[:n], self._reach[:n])
+        goal, reach = self._goal[:n], self._reach[:n]
         limited = self.values["slowness"][:n] > 0
-        return np.where(limited, goal, now), np.where(limited, goal, before)
+        earlier = _moved(goal, before, reach * (1 - share))
+        later = _moved(goal, now, reach * share)
+        return np.where(limited, later, now), np.where(limited, earlier, before)
+
+
+def _moved(goal: Array, target: Array, reach: Array) -> Array:
+    """Move goals, in place, towards targets at most by a reach; their mean on the way."""
+    step = np.clip(target - goal, -reach, reach)
+    goal += step
+    late = np.abs(step) / np.maximum(reach, 1e-12)  # share of the time that it takes
+    return goal - step * late / 2
 
 
 class Cogging(Term):

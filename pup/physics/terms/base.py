@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from pup.physics.model import Model
 from pup.physics.writer import FieldWriter
 from pup.robot import RobotDescription
+from pup.robot_parts import PlaceKind
 
 Array = NDArray[np.float64]
-Kind = Literal["joint", "group", "body", "foot", "ground", "sensor", "bus", "robot"]
+Kind = PlaceKind
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,13 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Scene:
-    """What the terms of one batch know of their simulations.
+    """What the terms of one batch know of their simulations; those that change it do in `fields`.
 
     Attributes:
       robot: the robot.
       model: its compiled model.
       timestep: sub-step, s.
-      inertia: what each joint moves in the model's own pose, kg m²; like the others of shape
+      inertia: what each servo moves in the model's own pose, kg m²; like the others of shape
         (n_simulations, n_joints).
       armature: the rotors' share of it, kg m².
       limit: largest torque of the servos, N m.
@@ -92,6 +93,8 @@ class Drive:
       torque: of the proportional part, N m.
       upper: largest torque of the servo, N m.
       lower: smallest one.
+      slope: by how much the limit in the direction of motion falls with speed, N m s/rad; it holds
+        for the speed at the sub-step's end.
     """
 
     time: float
@@ -100,6 +103,7 @@ class Drive:
     torque: Array
     upper: Array
     lower: Array
+    slope: Array
 
 
 @dataclass
@@ -110,18 +114,28 @@ class Flow:
       time: since the recording's start, s.
       position: of the link, rad.
       velocity: of the link, rad/s.
+      coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
       bias: torque of gravity and motion that the joint holds against, N m; only where a term asks
         for it.
       torque: applied as it is, N m.
       damping: applied times the velocity at the sub-step's end, N m s/rad.
+      brake: against the torque, by damping outside the servo, N m.
+      viscous: the part of that damping applied times the velocity at the end, N m s/rad.
     """
 
     time: float
     position: Array
     velocity: Array
+    coming: Array
     bias: Array | None
     torque: Array
     damping: Array
+    brake: Array
+    viscous: Array
+
+    def carried(self) -> Array:
+        """The torque halfway through the sub-step, N m."""
+        return self.torque - self.damping * (self.velocity + self.coming) / 2
 
 
 class Term:
@@ -159,19 +173,30 @@ class Term:
     def fields(self, writer: FieldWriter) -> None:
         """Write model fields."""
 
-    def start(self, qpos: Array) -> None:
-        """See, and change in place, the starting configurations, (n_simulations, nq)."""
+    def start(self, position: Array, torso: Array) -> None:
+        """Change, in place, the start from what was read to what was.
+
+        Args:
+          position: of the joints, (n_simulations, n_joints), rad.
+          torso: its orientation by the IMU, (n_simulations, 4); NaN where none was read.
+        """
 
     def lateness(self, time: float, n: int) -> Array:
         """By how much commands come late, (n, n_joints) or (n, 1), s."""
         raise NotImplementedError
 
-    def command(self, now: Array, before: Array) -> tuple[Array, Array]:
-        """Change the targets that reach the controller at a sub-step's end and beginning."""
+    def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
+        """Change the targets that reach the controller.
+
+        Args:
+          now: at the sub-step's end, (n_active, n_joints), rad.
+          before: at its beginning.
+          share: of the sub-step for which `now` holds, broadcastable to them.
+        """
         raise NotImplementedError
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
-        """What the encoder tells of position and velocity."""
+        """What the encoder tells of the position, and the velocity of the motor."""
         raise NotImplementedError
 
     def error(self, error: Array) -> Array:

@@ -36,6 +36,8 @@ class Armature(Term):
     def fields(self, writer: FieldWriter) -> None:
         """See Term."""
         writer.field("dof_armature")[:, self.scene.model.dofs] += self.values["inertia"]
+        self.scene.armature[:] += self.values["inertia"]
+        self.scene.inertia[:] += self.values["inertia"]
 
 
 class ComOffset(Term):
@@ -62,10 +64,6 @@ class StructuralFlex(Transmission):
     layout = "carried"
     quantities = (Quantity("compliance", "rad/(N m)", 0.006, 0.1),)
     source = "estimate: 100 to 500 N m/rad"
-
-    def gap(self) -> Array:
-        """See Transmission."""
-        return np.zeros_like(self.values["compliance"])
 
     def give(self) -> Array:
         """See Transmission."""

@@ -28,7 +28,7 @@ class GroundCompliance(Term):
 
 
 class ContactRestitution(Term):
-    """A livelier contact: it damps less of an impact."""
+    """A livelier contact: as stiff as before, it damps less of an impact."""
 
     effect = "contact_restitution"
     kinds = ("ground", "foot")
@@ -39,8 +39,11 @@ class ContactRestitution(Term):
     def fields(self, writer: FieldWriter) -> None:
         """See Term."""
         solref = writer.field("geom_solref")
+        left = np.maximum(1 - self.values["share"], 0.02)
         for geom, column in self.scene.model.contacts:
-            solref[:, geom, 1] *= 1 - self.values["share"][:, column]
+            # MuJoCo's stiffness goes by the product of the two, its damping by the first.
+            solref[:, geom, 0] /= left[:, column]
+            solref[:, geom, 1] *= left[:, column]
 
 
 class GroundFriction(Term):
@@ -84,10 +87,9 @@ class GroundSlope(Term):
         for row in np.flatnonzero(self._lean[:, 1:].any(axis=1)):
             mujoco.mju_rotVecQuat(gravity[row], gravity[row].copy(), self._back[row])
 
-    def start(self, qpos: Array) -> None:
+    def start(self, position: Array, torso: Array) -> None:
         """See Term: the torso was read against gravity."""
-        leaning = self._lean[:, 1:].any(axis=1)
-        qpos[leaning, 3:7] = multiply(self._back[leaning], qpos[leaning, 3:7])
+        torso[:] = multiply(self._back, torso)
 
     def tilt(self, quaternion: Array, rows: NDArray[np.int64]) -> Array:
         """See Term."""

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics.implicit import implicit_share
 from pup.physics.terms.base import Flow, Quantity, Term
 
 Array = NDArray[np.float64]
@@ -14,27 +15,28 @@ GRIP = 3e-4
 class Friction(Term):
     """Friction of some level on a joint, as the deflection of a bristle (Dahl 1968).
 
-    The bristle follows the joint and slips at `level`; its deflection is integrated implicitly, so
-    that however stiff it is, the joint rests where friction holds it.
+    The bristle follows the joint and slips at `level`. Its torque is taken from between the
+    sub-step's middle, where the bristle is soft, and its end, where it is stiff: however stiff it
+    is, the joint rests where friction holds it.
     """
 
     def prepare(self) -> None:
         """See Term."""
-        shape = next(iter(self.values.values())).shape
-        self._bend = np.zeros(shape)
-        self._slip = np.ones(shape)
+        self._bend = np.zeros_like(self.scene.inertia)
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
         n, step, velocity = len(flow.torque), self.scene.timestep, flow.velocity
-        length = self.length(n)
-        bend, slip = self._bend[:n], self._slip[:n]
-        bend += step * velocity
-        bend /= slip
-        slip[:] = 1 + np.abs(velocity) * (step / length)
-        stiffness = self.level(flow) / length / slip
-        flow.torque -= stiffness * bend
-        flow.damping += stiffness * step
+        length, bend = self.length(n), self._bend[:n]
+        kept = np.exp(-np.abs(velocity) * (step / length))
+        bend *= kept
+        bend += np.sign(velocity) * (length * (1 - kept))
+        stiffness = self.level(flow) / length
+        share = implicit_share(stiffness * step, self.scene.inertia[:n], step)
+        slip = np.maximum(np.abs(flow.coming) * (share * step / length), 1e-9)
+        kept = np.exp(-slip)
+        flow.torque -= stiffness * kept * bend
+        flow.damping += stiffness * step * share * (1 - kept) / slip
 
     def level(self, flow: Flow) -> Array:
         """Friction torque of a joint that slips, N m."""
@@ -105,7 +107,7 @@ class LoadDependentFriction(Friction):
     def level(self, flow: Flow) -> Array:
         """See Friction."""
         assert flow.bias is not None
-        load = np.abs(flow.torque - flow.damping * flow.velocity + flow.bias)
+        load = np.abs(flow.carried() + flow.bias)
         return self.values["share"][: len(load)] * load
 
 
@@ -118,7 +120,7 @@ class GearEfficiency(Friction):
 
     def level(self, flow: Flow) -> Array:
         """See Friction."""
-        carried = np.abs(flow.torque - flow.damping * flow.velocity)
+        carried = np.abs(flow.carried())
         return self.values["loss"][: len(carried)] * carried
 
 
@@ -142,4 +144,4 @@ class FrictionAsymmetry(Friction):
     def level(self, flow: Flow) -> Array:
         """See Friction."""
         torque = self.values["torque"][: len(flow.torque)]
-        return np.where(torque * flow.velocity > 0, np.abs(torque), 0.0)
+        return np.where(torque * self._bend[: len(torque)] >= 0, np.abs(torque), 0.0)

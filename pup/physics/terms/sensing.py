@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.rotations import multiply, rotation
+from pup.physics.rotations import CONJUGATE, multiply, rotation
 from pup.physics.terms.base import Quantity, Term
 
 Array = NDArray[np.float64]
@@ -17,9 +17,9 @@ class EncoderBias(Term):
     quantities = (Quantity("offset", "rad", 0.02, 0.3, signed=True),)
     source = "estimate: 5 to 50 mrad after reassembly"
 
-    def start(self, qpos: Array) -> None:
+    def start(self, position: Array, torso: Array) -> None:
         """See Term: what was read first has the bias in it."""
-        qpos[:, self.scene.model.qpos] -= self.values["offset"]
+        position -= self.values["offset"]
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
@@ -37,10 +37,10 @@ class EncoderEccentricity(Term):
     )
     source = "estimate: 5 to 12 mrad"
 
-    def start(self, qpos: Array) -> None:
+    def start(self, position: Array, torso: Array) -> None:
         """See Term."""
-        where = self.scene.model.qpos
-        qpos[:, where] -= self._off(qpos[:, where])
+        nearly = position - self._off(position)
+        position -= self._off(nearly)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
@@ -81,6 +81,10 @@ class ImuMisalignment(Term):
     def prepare(self) -> None:
         """See Term."""
         self._mount = rotation(np.hstack([self.values[a] for a in ("roll", "pitch", "yaw")]))
+
+    def start(self, position: Array, torso: Array) -> None:
+        """See Term: what was read first was read askew."""
+        torso[:] = multiply(torso, self._mount * CONJUGATE)
 
     def tilt(self, quaternion: Array, rows: NDArray[np.int64]) -> Array:
         """See Term."""

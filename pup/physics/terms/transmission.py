@@ -1,38 +1,72 @@
 """Between motor and link: play, give, springs and stops."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.terms.base import Flow, Quantity, Term
+from pup.physics.implicit import implicit_share
+from pup.physics.terms.base import Flow, Quantity, Scene, Term
 from pup.physics.writer import FieldWriter
 
 Array = NDArray[np.float64]
 
+RELAXATION = 1e-3
+"""Time constant of the damping in gears and stops that give, s: 0.2 of critical at 60 Hz."""
+
 
 class Transmission(Term):
-    """A motor with its own rotor that reaches the link through play and give.
-
-    Motor and link are two masses. The motor's step is solved together with the link's: seen from
-    the link, the rest is a torque and a viscous coefficient, whatever the stiffness between them,
-    and as play and give go to nothing the rotor's inertia goes back to the link.
-    """
+    """Play or give between motor and link; a Drivetrain puts all of a joint's in series."""
 
     def gap(self) -> Array:
         """Half of the play, (n_simulations, n_joints), rad."""
-        raise NotImplementedError
+        return np.zeros_like(self.scene.inertia)
 
     def give(self) -> Array:
         """Compliance, same shape, rad/(N m)."""
-        raise NotImplementedError
+        return np.zeros_like(self.scene.inertia)
 
     def behind(self) -> Array:
-        """Share of the play and give that the encoder sees: 0 at the motor, 1 at the link."""
+        """Share of the play and give that the encoder is behind: 0 at the motor, 1 at the link."""
         raise NotImplementedError
+
+
+class Drivetrain(Term):
+    """Motors with their own rotors that reach the links through play and give.
+
+    Motor and link are two masses. The motor's step is solved together with the link's: seen from
+    the link, the rest is a torque and a viscous coefficient, whatever the stiffness between them,
+    and as play and give go to nothing the rotor's inertia goes back to the link. The servo's and
+    the joint's damping act on the motor.
+
+    Attributes:
+      rows: the simulations that have any.
+
+    Args:
+      parts: the play and the give.
+      scene: what they act on.
+    """
+
+    def __init__(self, parts: Sequence[Transmission], scene: Scene) -> None:
+        self._gap = np.asarray(sum(part.gap() for part in parts))
+        self._give = np.asarray(sum(part.give() for part in parts))
+        # Of the play and of the give, what an encoder sees that is not behind them.
+        ahead = [1 - part.behind() for part in parts]
+        play = sum(part.gap() * share for part, share in zip(parts, ahead, strict=True))
+        bend = sum(part.give() * share for part, share in zip(parts, ahead, strict=True))
+        self._play_seen = play / np.maximum(self._gap, 1e-12)
+        self._bend_seen = bend / np.maximum(self._give, 1e-12)
+        self._active = (self._gap > 0) | (self._give > 0)
+        self.rows = np.flatnonzero(self._active.any(axis=1)).astype(np.int32)
+        self._first: Array | None = None
+        super().__init__({}, scene)
 
     def prepare(self) -> None:
         """See Term."""
-        self._gap, self._give, self._behind = self.gap(), self.give(), self.behind()
-        self.active = (self._gap > 0) | (self._give > 0)
+        step = self.scene.timestep
+        self._rotor = np.maximum(self.scene.armature, 1e-7) / step
+        implicit = implicit_share(step / np.maximum(self._give, 1e-9), self._rotor * step, step)
+        self._reach = implicit * step + np.where(self._give > 0, RELAXATION, 0.0)
         self._position: Array | None = None
         self._velocity = np.zeros_like(self._gap)
         self._free = np.zeros_like(self._gap)
@@ -41,45 +75,60 @@ class Transmission(Term):
 
     def fields(self, writer: FieldWriter) -> None:
         """See Term: the rotor leaves the link."""
-        armature = writer.field("dof_armature")
-        dofs = self.scene.model.dofs
-        armature[:, dofs] = np.where((self.gap() > 0) | (self.give() > 0), 0.0, armature[:, dofs])
+        armature, dofs = writer.field("dof_armature"), self.scene.model.dofs
+        armature[:, dofs] = np.where(self._active, 0.0, armature[:, dofs])
+        np.copyto(self.scene.inertia, self.scene.armature, where=self._active)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
         n = len(position)
         if self._position is None:
             self._position = position.copy()
-            self._velocity[:] = velocity
+            self._velocity[:] = velocity if self._first is None else self._first
         else:
             torque, damping = (part[:n] for part in self._sent)
             carried = torque - damping * velocity
             self._velocity[:n] = self._free[:n] - carried / self._heft[:n]
             self._position[:n] += self.scene.timestep * self._velocity[:n]
-        behind, active = self._behind[:n], self.active[:n]
-        told = behind * position + (1 - behind) * self._position[:n]
-        speed = behind * velocity + (1 - behind) * self._velocity[:n]
-        return np.where(active, told, position), np.where(active, speed, velocity)
+        active, gap = self._active[:n], self._gap[:n]
+        ahead = self._position[:n] - position
+        play = np.clip(ahead, -gap, gap)
+        told = position + self._play_seen[:n] * play + self._bend_seen[:n] * (ahead - play)
+        return np.where(active, told, position), np.where(active, self._velocity[:n], velocity)
+
+    def tried(self, position: Array, velocity: Array, before: Array) -> None:
+        """Learn from a first sub-step how fast the motors are half a sub-step before the start.
+
+        Args:
+          position: of the links after it, (n_simulations, n_joints), rad.
+          velocity: of the links after it, rad/s.
+          before: of the links and the motors before it, rad/s.
+        """
+        self.sense(position, velocity)
+        self._first = before - (self._velocity - before) / 2
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
         assert self._position is not None
         n, step = len(flow.torque), self.scene.timestep
-        gap, heft = self._gap[:n], self._heft[:n]
-        rotor = np.maximum(self.scene.armature[:n], 1e-7) / step
-        heft[:] = rotor + flow.damping
-        self._free[:n] = (rotor * self._velocity[:n] + flow.torque) / heft
+        active, gap, heft, reach = self._active[:n], self._gap[:n], self._heft[:n], self._reach[:n]
+        rotor = self._rotor[:n]
+        heft[:] = rotor + flow.damping + flow.viscous
+        pull = flow.torque - flow.brake
+        self._free[:n] = (rotor * self._velocity[:n] + pull) / heft
         ahead = self._position[:n] - flow.position
         coming = ahead + step * (self._free[:n] - flow.velocity)
-        beyond = coming - np.clip(coming, -gap, gap)
-        side = np.sign(beyond) * gap
-        grip = step / (self._give[:n] + step / heft)
-        torque = np.where(beyond != 0, grip * ((ahead - side) / step + self._free[:n]), 0.0)
-        damping = np.where(beyond != 0, grip, 0.0)
+        touching = np.abs(coming) >= gap
+        grip = reach / (self._give[:n] + reach / heft)
+        beyond = ahead - np.copysign(gap, coming)
+        torque = np.where(touching, grip * (beyond / reach + self._free[:n]), 0.0)
+        damping = np.where(touching, grip, 0.0)
         for sent, part in zip(self._sent, (torque, damping), strict=True):
             sent[:n] = part
-        np.copyto(flow.torque, torque, where=self.active[:n])
-        np.copyto(flow.damping, damping, where=self.active[:n])
+        np.copyto(flow.torque, torque, where=active)
+        np.copyto(flow.damping, damping, where=active)
+        flow.brake = np.where(active, 0.0, flow.brake)
+        flow.viscous = np.where(active, 0.0, flow.viscous)
 
 
 class Backlash(Transmission):
@@ -96,10 +145,6 @@ class Backlash(Transmission):
         """See Transmission."""
         return self.values["gap"]
 
-    def give(self) -> Array:
-        """See Transmission."""
-        return np.zeros_like(self.values["gap"])
-
     def behind(self) -> Array:
         """See Transmission."""
         return self.values["behind"]
@@ -114,10 +159,6 @@ class JointCompliance(Transmission):
         Quantity("behind", "1", 1.0, 1.0, grid=(0.0, 1.0)),
     )
     source = "estimate: 60 to 300 N m/rad"
-
-    def gap(self) -> Array:
-        """See Transmission."""
-        return np.zeros_like(self.values["compliance"])
 
     def give(self) -> Array:
         """See Transmission."""
@@ -152,16 +193,20 @@ class JointStop(Term):
     kinds = ("joint",)
     quantities = (
         Quantity("stiffness", "N m/rad", 20.0, 500.0),
-        Quantity("angle", "rad", 0.0, 3.2, grid=(-1.0, 1.0)),
-        Quantity("side", "1", 1.0, 1.0, grid=(-1.0, 1.0)),
+        Quantity("angle", "rad", 0.0, 3.2, signed=True, grid=(-1.0, 1.0)),
+        Quantity("side", "1", 1.0, 1.0, signed=True, grid=(-1.0, 1.0)),
     )
     source = "geometry; stiffness of plastic parts"
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n = len(flow.torque)
+        n, step = len(flow.torque), self.scene.timestep
         stiffness, side = self.values["stiffness"][:n], np.sign(self.values["side"][:n])
         into = side * (flow.position - self.values["angle"][:n])
-        pressed = np.where(into > 0, stiffness, 0.0)
-        flow.torque -= side * pressed * into
-        flow.damping += pressed * self.scene.timestep
+        speed = side * flow.velocity
+        share = implicit_share(stiffness * step, self.scene.inertia[:n], step)
+        reach = share * step + RELAXATION
+        pressed = (into + share * step * speed > 0) & (into + reach * speed > 0)
+        stiffness = np.where(pressed, stiffness, 0.0)
+        flow.torque -= side * stiffness * into
+        flow.damping += stiffness * reach

@@ -1,0 +1,224 @@
+"""Drawing cases: what is concealed in each, before anything is simulated of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pup.blind.absorb import readings
+from pup.blind.catalogue import CLASS_OF, KINDS, MASKED, available, draw, unlisted
+from pup.blind.kit import Kit
+from pup.blind.programme import USUAL, Programme, programme
+from pup.blind.sensors import Noise
+from pup.blind.world import Effect, Engine, Nominal, Plan, World, nominal_names
+from pup.errors import InputError
+from pup.robot import RobotDescription
+
+SPREAD = 0.25  # relative, of the nominal parameters
+WIDE_SPREAD = 0.6  # the same of nulls with wrong parameters
+SIZES = (0.5, 1.5)  # times typical
+NUISANCES, NUISANCE = 2, (0.03, 0.15)  # how many, and times typical
+ROUGH, ROUGH_GAPS = 0.15, (1 / 40, 1 / 18)  # share of rough sensors; s between ticks
+FALLEN = 0.9  # rad of roll or pitch at which a fall's recording ends
+TOLD_BY_FALLS = ("imu_delay",)
+TOLD_BY_STEPS = ("contact_restitution", "ground_friction")
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A case in the making.
+
+    Attributes:
+      stratum: what it is drawn for; nulls begin with `null:`.
+      world: the robot with the effects to be found.
+      plans: what is played.
+      noise: of its sensors.
+      values: its nominal parameters by name.
+      nuisance: small other effects.
+      verdicts: those that the data allow, where they cannot tell.
+      answers: effects that they cannot tell apart.
+      room: by how much the effects' size may still grow.
+    """
+
+    stratum: str
+    world: World
+    plans: tuple[Plan, ...]
+    noise: Noise
+    values: Mapping[str, float]
+    nuisance: tuple[Effect, ...] = ()
+    verdicts: tuple[str, ...] = ()
+    answers: tuple[str, ...] = ()
+    room: float = 1.0
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """What is to be found."""
+        return self.world.effects
+
+    def full(self) -> World:
+        """The robot with its nuisance."""
+        return replace(self.world, effects=(*self.world.effects, *self.nuisance))
+
+
+def _values(
+    robot: RobotDescription, ground: bool, spread: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Nominal parameters away from the description's by up to a relative spread."""
+    names = nominal_names(robot, ground)
+    known = {spec.name: spec for spec in robot.parameters}
+    factors = np.exp(rng.uniform(np.log(1 - spread), np.log(1 + spread), size=len(names)))
+    drawn = {n: known[n].nominal * float(f) for n, f in zip(names, factors, strict=True)}
+    return {n: float(np.clip(v, *known[n].search)) for n, v in drawn.items()}
+
+
+def _base(
+    robot: RobotDescription,
+    stratum: str,
+    ground: bool,
+    rng: np.random.Generator,
+    spread: float = SPREAD,
+    wants: Programme = USUAL,
+    rough: bool = False,
+) -> Draft:
+    """Robot, sensors and plans, without effects; rough sensors have a memory and lose samples."""
+    values = _values(robot, ground, spread, rng)
+    world = World(robot, Nominal.of(robot, values), seed=int(rng.integers(2**31)), engine=Engine())
+    noise = Noise(position=float(rng.uniform(0.001, 0.002)), imu=float(rng.uniform(0.001, 0.003)))
+    if rough:
+        noise = replace(
+            noise,
+            memory=float(rng.uniform(0.4, 0.85)),
+            lost=float(rng.uniform(0.003, 0.02)),
+            gaps=float(rng.uniform(0.01, 0.05)),
+        )
+        wants = replace(wants, gaps=ROUGH_GAPS)
+    plans = tuple(_cut(world, plan) for plan in programme(robot, ground, wants, rng))
+    return Draft(stratum, world, plans, noise, values)
+
+
+def _cut(world: World, plan: Plan) -> Plan:
+    """A fall up to where the robot is switched off; other plans as they are."""
+    if plan.motion != "fall":
+        return plan
+    tilt = readings(world, [plan])[0][plan.id].tilt
+    rows = max(10, int(np.argmax([*(np.abs(tilt).max(axis=1) > FALLEN), True])))
+    return replace(plan, time=plan.time[:rows], target=plan.target[:rows])
+
+
+def draw_null(robot: RobotDescription, kind: str, ground: bool, rng: np.random.Generator) -> Draft:
+    """Nothing material is missing."""
+    spread = WIDE_SPREAD if kind == "parameters" else SPREAD
+    draft = _base(robot, f"null:{kind}", ground, rng, spread, rough=kind == "coloured")
+    if kind == "engine":
+        return replace(draft, world=replace(draft.world, engine=_engine(robot.floating, rng)))
+    if kind == "nuisance":
+        return replace(draft, nuisance=_nuisance(Kit.of(robot, ground), (), rng))
+    return draft
+
+
+def _engine(ground: bool, rng: np.random.Generator) -> Engine:
+    """Another integrator, step or contact solver than ours."""
+    engine = [
+        Engine(native=True, integrator="implicitfast", step=0.001),
+        Engine(native=True, integrator="implicit", step=0.0005),
+        Engine(native=True, integrator="implicitfast", step=0.00025),
+        Engine(integrator="rk4", step=0.00025, predicted=False),
+        Engine(integrator="euler", step=0.00025, predicted=False),
+    ][int(rng.integers(5))]
+    if ground:  # smaller steps would take minutes
+        return replace(
+            engine,
+            step=max(engine.step, 0.0005),
+            cone=str(rng.choice(["pyramidal", "elliptic"])),
+            solver=str(rng.choice(["newton", "cg"])),
+            impratio=float(rng.choice([1.0, 5.0])),
+            contact_time=float(rng.choice([0.01, 0.02])),
+        )
+    return engine
+
+
+def _nuisance(kit: Kit, besides: Sequence[Effect], rng: np.random.Generator) -> tuple[Effect, ...]:
+    """Small other effects, of other classes than those of the case."""
+    taken = {CLASS_OF.get(effect.name) for effect in besides}
+    names = [n for n in available(kit) if CLASS_OF[n] not in taken and n != "joint_stop"]
+    chosen: list[Effect] = []
+    for name in rng.permutation(names):
+        if CLASS_OF[name] not in {CLASS_OF[e.name] for e in chosen}:
+            chosen.append(draw(str(name), kit, rng).scaled(float(rng.uniform(*NUISANCE))))
+        if len(chosen) == NUISANCES:
+            break
+    return tuple(chosen)
+
+
+def draw_case(
+    robot: RobotDescription, stratum: str, ground: bool, rng: np.random.Generator
+) -> Draft:
+    """Something is missing."""
+    kit = Kit.of(robot, ground)
+    if stratum == "unidentifiable":
+        return _unidentifiable(kit, rng)
+    names = list(available(kit))
+    if ground and rng.uniform() < 0.6:
+        names = [n for n in names if KINDS[n].where == "ground" or "body" in KINDS[n].places]
+    if stratum == "masked":
+        names = [n for n in names if n in MASKED]
+    if stratum in ("below_noise", "weak"):
+        names = [n for n in names if n != "joint_stop"]
+    if stratum == "unlisted":
+        effects = [draw(str(rng.choice(unlisted())), kit, rng)]
+    else:
+        first, second = (str(n) for n in rng.choice(names, size=2, replace=False))
+        effects = [draw(first, kit, rng)]
+        if stratum == "pair":
+            if CLASS_OF[first] == CLASS_OF[second]:
+                raise InputError("a pair of one class")
+            effects.append(draw(second, kit, rng))
+    factor = float(rng.uniform(*SIZES))
+    effects = [e.scaled(factor) for e in effects]
+    wants = Programme(
+        fall=any(e.name in TOLD_BY_FALLS for e in effects),
+        walk=any(e.name in TOLD_BY_STEPS for e in effects),
+        powered=stratum == "masked",
+        plain=stratum == "masked",
+    )
+    draft = _base(robot, stratum, ground, rng, wants=wants, rough=rng.uniform() < ROUGH)
+    effects = [_stopped(draft, e) for e in effects]
+    nuisance = _nuisance(kit, effects, rng) if rng.uniform() < 0.5 else ()
+    world = replace(draft.world, effects=tuple(effects))
+    return replace(draft, world=world, nuisance=nuisance, room=SIZES[1] / factor)
+
+
+def _stopped(draft: Draft, effect: Effect) -> Effect:
+    """Put a stop within the joint's way, which only the motion itself can tell."""
+    if effect.name != "joint_stop":
+        return effect
+    joint = draft.world.joints_at(effect.place)[0]
+    seen = readings(draft.world, draft.plans)[0]
+    way = np.concatenate([s.position[:, joint] for s in seen.values()])
+    share, side = effect.shape["quantile"], effect.shape["side"]
+    return replace(effect, size=float(np.quantile(way, share if side > 0 else 1 - share)))
+
+
+def _unidentifiable(kit: Kit, rng: np.random.Generator) -> Draft:
+    """Effects that the recordings cannot tell apart, or cannot tell from nominal parameters."""
+    robot = kit.robot
+    alone = len(robot.joints) == 1
+    form = str(rng.choice(["delay", "mass", "bias"])) if alone else "delay"
+    wants = Programme(powered=True, plain=True)
+    draft = _base(robot, "unidentifiable", False, rng, wants=wants)
+    kit, factor = Kit.of(robot, False), float(rng.uniform(*SIZES))
+    verdicts: tuple[str, ...] = ("mismatch", "undetermined")
+    answers: tuple[str, ...]
+    if form == "mass":
+        effect = draw("payload", kit, rng).scaled(factor)
+        verdicts, answers = ("none", "undetermined"), ("payload",)
+    elif form == "bias":
+        answers = ("com_offset", "encoder_bias")
+        effect = draw(str(rng.choice(answers)), kit, rng).scaled(factor)
+    else:
+        answers = ("command_delay", "measurement_delay")
+        places = ("joint",) if alone else ("bus",)
+        effect = draw(str(rng.choice(answers)), kit, rng, places).scaled(factor)
+        effect = replace(effect, shape={"jitter": 0.0, "lost": 0.0}, form="together")
+    world = replace(draft.world, effects=(effect,))
+    return replace(draft, world=world, verdicts=verdicts, answers=answers)

@@ -1,0 +1,199 @@
+"""Scoring verdicts against a revealed key."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pup.blind.absorb import MATERIAL
+from pup.blind.judge import Judged, judge
+from pup.blind.seal import COMMITMENT, verify
+from pup.blind.statistics import calibration, mean, share
+from pup.errors import InputError
+from pup.files import read_json
+from pup.recording import Recording, load_recordings
+from pup.robot import RobotDescription
+
+TOP = 3
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """How well a diagnosis predicts motions it was never given.
+
+    Attributes:
+      nominal: rms error of the refitted nominal model, rad.
+      corrected: rms error of the corrected robot, rad.
+    """
+
+    nominal: float
+    corrected: float
+
+
+Replay = Callable[[Path, Sequence[Recording]], Replayed]
+"""Replays the folder of a diagnosis, with its `corrected/`, on test recordings."""
+
+
+def score_set(
+    folder: Path, key: Path, diagnoses: Path, replay: Replay | None = None
+) -> dict[str, Any]:
+    """Score a set.
+
+    Args:
+      folder: the set.
+      key: its key.
+      diagnoses: folder with `case_<id>/diagnosis.json` for every case.
+      replay: how to replay a corrected robot; without it there is no oracle ratio.
+
+    Returns:
+      The scores, as JSON values. `all` and the robots' scores leave the stratum `weak` out, which
+      has a line of its own.
+
+    Raises:
+      InputError: the key or the set is not the one committed to, or there is no diagnosis at all.
+    """
+    truths = verify(folder, key)["cases"]
+    if not any(diagnoses.glob("case_*/diagnosis.json")):
+        raise InputError(f"{diagnoses}: no case_<id>/diagnosis.json in it")
+    robots = {name: RobotDescription.load(name) for name in {t["robot"] for t in truths}}
+    judged = []
+    for truth in truths:
+        place = diagnoses / f"case_{truth['id']}"
+        document = _diagnosis(place / "diagnosis.json")
+        robot = robots[truth["robot"]]
+        oracle = None
+        if document is not None and replay is not None:
+            oracle = _oracle(truth, folder / f"case_{truth['id']}" / "test", place, replay)
+        try:
+            judged.append(judge(truth, document, robot, oracle))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{place / 'diagnosis.json'}: does not follow the contract ({error!r})"
+            ) from error
+    real = [case for case in judged if not case.null]
+    claims = [case for case in judged if case.confidence is not None and not case.excused]
+    strata = sorted({case.stratum for case in judged})
+    return {
+        "schema": 1,
+        "commitment": read_json(folder / COMMITMENT),
+        "cases": len(judged),
+        "missing": sum(case.verdict == "missing" for case in judged),
+        "all": _omissions([case for case in real if case.stratum != "weak"]),
+        "nulls": _nulls([case for case in judged if case.null]),
+        "per_stratum": {
+            stratum: _nulls(group) if stratum.startswith("null:") else _omissions(group)
+            for stratum in strata
+            if (group := [case for case in judged if case.stratum == stratum])
+        },
+        "per_robot": {
+            name: _omissions([c for c in real if c.robot == name and c.stratum != "weak"])
+            | {"nulls": _nulls([c for c in judged if c.null and c.robot == name])}
+            for name in sorted(robots)
+        },
+        "calibration": calibration(
+            [c.confidence for c in claims if c.confidence is not None],
+            [c.kind == 1 for c in claims],
+        ),
+        "failures": [_failure(case) for case in judged if _faults(case)],
+    }
+
+
+def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
+    """The scores of cases in which something is missing."""
+    listed = [c for c in cases if c.stratum not in ("unlisted", "unidentifiable")]
+    open_ = [c for c in cases if c.stratum == "unidentifiable"]
+    grouped = [c for c in cases if c.size is not None]
+    unclear = [c for c in cases if c.ambiguous]
+    claims = [c for c in cases if c.confidence is not None]
+    return {
+        "detected": share([c.verdict == "mismatch" for c in cases if c not in open_]),
+        "exact_top1": share([c.exact == 1 for c in listed]),
+        "exact_top3": share([_within(c.exact) for c in listed]),
+        "class_top1": share([c.kind == 1 for c in listed]),
+        "class_top3": share([_within(c.kind) for c in listed]),
+        "pairs_both_in_top3": share([bool(c.all_found) for c in cases if c.stratum == "pair"]),
+        "place_top1": mean([c.place for c in listed if c.place is not None]),
+        "set_covers": share([bool(c.covered) for c in grouped]),
+        "set_size": mean([float(c.size) for c in grouped if c.size is not None]),
+        "regime_f1": mean([c.regime for c in cases if c.regime is not None]),
+        "parameter_error": mean([e for c in cases for e in c.errors]),
+        "parameter_in_ci90": share([i for c in cases for i in c.inside]),
+        "unidentifiable_allowed": share([c.allowed and not c.sharp for c in open_]),
+        "unlisted_flagged": share([c.unknown for c in cases if c.stratum == "unlisted"]),
+        "listed_flagged_unknown": share([c.unknown for c in listed]),
+        "ambiguous_with_next_recording": share([c.next for c in unclear]),
+        "oracle_ratio": mean([c.oracle for c in cases if c.oracle is not None]),
+        "calibration": calibration(
+            [c.confidence for c in claims if c.confidence is not None],
+            [c.kind == 1 for c in claims],
+        ),
+        "seconds": mean([c.seconds for c in cases if c.seconds is not None]),
+    }
+
+
+def _nulls(cases: Sequence[Judged]) -> dict[str, Any]:
+    """The scores of cases in which nothing material is missing."""
+    counted = [c for c in cases if not c.excused]
+    return {
+        "false_positives": share([c.verdict == "mismatch" for c in counted]),
+        "told_none": share([c.verdict == "none" for c in counted]),
+        "undetermined": share([c.verdict == "undetermined" for c in counted]),
+        "material_nuisance": share([c.verdict == "mismatch" for c in cases if c.excused]),
+        "seconds": mean([c.seconds for c in cases if c.seconds is not None]),
+    }
+
+
+def _within(rank: int | None) -> bool:
+    return rank is not None and rank <= TOP
+
+
+def _faults(case: Judged) -> list[str]:
+    """What is wrong with a verdict, in words."""
+    if case.verdict == "missing":
+        return ["no diagnosis"]
+    if case.null:
+        return ["false positive"] if case.verdict == "mismatch" and not case.excused else []
+    if case.stratum == "unidentifiable":
+        faults = [] if case.allowed else [f"verdict {case.verdict}"]
+        return faults + ["sharp name where the data cannot tell"] * case.sharp
+    if case.verdict != "mismatch":
+        return [] if case.allowed else ["missed"]
+    if case.stratum == "unlisted":
+        return [] if case.unknown else ["not told to be outside the list"]
+    faults = [] if case.kind == 1 else ["wrong class"]
+    if case.kind == 1 and case.exact != 1:
+        faults.append("wrong effect of the class")
+    if case.stratum == "pair" and not case.all_found:
+        faults.append("one of two found")
+    return faults + ["wrong place"] * (case.place is not None and case.place < 1)
+
+
+def _failure(case: Judged) -> dict[str, Any]:
+    return {
+        "case": case.id,
+        "robot": case.robot,
+        "stratum": case.stratum,
+        "faults": _faults(case),
+        "named": list(case.named),
+    }
+
+
+def _diagnosis(path: Path) -> dict[str, Any] | None:
+    """A diagnosis; None where there is none."""
+    if not path.is_file():
+        return None
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("schema") != 1:
+        raise InputError(f"{path}: not a diagnosis (schema 1)")
+    return document
+
+
+def _oracle(truth: Mapping[str, Any], tests: Path, diagnosed: Path, replay: Replay) -> float | None:
+    """Share of the possible gain on test motions; None where there is next to none to be had."""
+    if not tests.is_dir() or not (diagnosed / "corrected").is_dir():
+        return None
+    errors = replay(diagnosed, load_recordings([tests]))
+    # Who knows the form and refits everything is left with the noise.
+    best = float(truth["noise"]["sigma"])
+    possible = errors.nominal - best
+    return (errors.nominal - errors.corrected) / possible if possible > MATERIAL * best else None

@@ -1,0 +1,95 @@
+"""The scores of a blind set as a page to read."""
+
+from collections.abc import Mapping
+from typing import Any
+
+ROWS = {
+    "detected": "detected",
+    "exact_top1": "exact effect, first",
+    "exact_top3": "exact effect, first three",
+    "class_top1": "class, first",
+    "class_top3": "class, first three",
+    "pairs_both_in_top3": "pairs: both classes in the first three",
+    "place_top1": "place, first (mirror: half)",
+    "set_covers": "equivalence set holds the truth",
+    "set_size": "size of that set",
+    "regime_f1": "times at which it acts, F1",
+    "parameter_error": "relative error of parameters",
+    "parameter_in_ci90": "truth in the 90 % interval",
+    "unidentifiable_allowed": "unidentifiable: told so, no sharp name",
+    "unlisted_flagged": "outside the list: told so",
+    "listed_flagged_unknown": "on the list: told to be outside",
+    "ambiguous_with_next_recording": "ambiguous: next recording proposed",
+    "oracle_ratio": "oracle ratio on test motions",
+    "calibration": "calibration of the class",
+    "seconds": "seconds per diagnosis",
+}
+NULL_ROWS = {
+    "false_positives": "false positives",
+    "told_none": "told `none`",
+    "undetermined": "told `undetermined`",
+    "material_nuisance": "material nuisance found (not counted above)",
+}
+FEW = ("detected", "exact_top1", "class_top1", "class_top3", "place_top1", "set_covers")
+
+
+def markdown(scores: Mapping[str, Any]) -> str:
+    """The scores as Markdown."""
+    lines = [
+        f"# Blind score: {scores['cases']} cases, {scores['missing']} without a diagnosis",
+        "",
+        f"Commitment {scores['commitment']['key_sha256']}, "
+        f"engine {scores['commitment']['engine_git_sha'] or 'not named'}.",
+        "",
+        "| omissions | value | 95 % |",
+        "|---|---|---|",
+        *(_row(told, scores["all"][name]) for name, told in ROWS.items()),
+        "",
+        "| nulls | value | 95 % |",
+        "|---|---|---|",
+        *(_row(told, scores["nulls"][name]) for name, told in NULL_ROWS.items()),
+        "",
+        *_few("stratum", scores["per_stratum"]),
+        "",
+        *_few("robot", scores["per_robot"]),
+        "",
+        f"## Failures: {len(scores['failures'])}",
+        "",
+        "| case | robot | stratum | what | named |",
+        "|---|---|---|---|---|",
+        *(
+            f"| {f['case']} | {f['robot']} | {f['stratum']} | {'; '.join(f['faults'])} "
+            f"| {', '.join(f['named'])} |"
+            for f in scores["failures"]
+        ),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _row(told: str, value: Mapping[str, Any]) -> str:
+    interval = value.get("ci95")
+    limits = f"{interval[0]:.3f} to {interval[1]:.3f}" if interval else ""
+    return f"| {told} | {_cell(value)} | {limits} |"
+
+
+def _cell(value: Mapping[str, Any]) -> str:
+    """One score in a few characters."""
+    if not value["of"]:
+        return "-"
+    if "rate" in value:
+        return f"{value['rate']:.2f} ({value['hits']}/{value['of']})"
+    if "ece" in value:
+        return f"ECE {value['ece']:.3f}, Brier {value['brier']:.3f} ({value['of']})"
+    return f"{value['mean']:.3g}, median {value['median']:.3g} ({value['of']})"
+
+
+def _few(what: str, groups: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A line per group with the main scores."""
+    names = (*FEW, "false_positives")
+    titles = [{**ROWS, **NULL_ROWS}[name] for name in names]
+    lines = [f"| {what} | {' | '.join(titles)} |", "|---" * (len(names) + 1) + "|"]
+    for group, scores in groups.items():
+        flat = {**scores.get("nulls", {}), **scores}
+        cells = [_cell(flat[name]) if name in flat else "-" for name in names]
+        lines.append(f"| {group} | {' | '.join(cells)} |")
+    return lines

@@ -1,0 +1,85 @@
+"""`diagnosis.json` (CONTRACTS.md, section 5)."""
+
+from typing import Any
+
+import numpy as np
+
+from pup.diagnosis.engine import Diagnosis
+from pup.diagnosis.verdict import Finding, HeldOut
+from pup.physics.terms import Place
+from pup.robot import RobotDescription
+
+SCHEMA = 1
+
+
+def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
+    """A diagnosis as JSON values.
+
+    Args:
+      diagnosis: what was found.
+      corrected: path of the corrected robot.
+    """
+    robot, noise = diagnosis.robot, diagnosis.noise
+    joints = len(robot.joints)
+    certificate = diagnosis.nominal.certificate
+    return {
+        "schema": SCHEMA,
+        "robot": robot.name,
+        "verdict": diagnosis.verdict,
+        "reason": diagnosis.reason,
+        "converged": certificate.holds,
+        "noise_floor": {
+            "rms": float(np.sqrt(np.mean(noise.sigma[:joints] ** 2))),
+            "source": noise.source,
+        },
+        "findings": [_finding(f, robot) for f in diagnosis.findings],
+        "held_out": _held_out(diagnosis.held_out),
+        "next_recording": None,
+        "corrected_robot": corrected,
+        "certificate": {"chi2": list(certificate.starts), "recovered": certificate.recovered},
+        "nominal": {n: float(v) for n, v in diagnosis.nominal.fit.values.items()},
+        "samples": len(diagnosis.measured.values),
+        "simulations": diagnosis.replays,
+    }
+
+
+def _finding(finding: Finding, robot: RobotDescription) -> dict[str, Any]:
+    return {
+        "effect": finding.effect,
+        "place": _place(finding.place, robot),
+        "regime": finding.regime,
+        "when": [{"recording": w.recording, "start": w.start, "end": w.end} for w in finding.when],
+        "parameters": {
+            name: {"value": p.value, "unit": p.unit, "ci90": [p.lower, p.upper]}
+            for name, p in finding.parameters.items()
+        },
+        "probability": round(finding.probability, 6),
+        "equivalents": [
+            {
+                "effect": a.effect,
+                "place": _place(a.place, robot),
+                "probability": round(a.probability, 6),
+            }
+            for a in finding.equivalents
+        ],
+        "absorbed_by": dict(finding.absorbed_by),
+        "law": finding.law,
+    }
+
+
+def _place(place: Place, robot: RobotDescription) -> dict[str, Any]:
+    named = {"bus": "bus", "robot": robot.name, "ground": "floor", "sensor": "imu"}
+    return {"kind": place.kind, "names": [place.name or named[place.kind]]}
+
+
+def _held_out(errors: HeldOut | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    return {
+        "recordings": list(errors.recordings),
+        "rmse_before": errors.before,
+        "rmse_after": errors.after,
+        "improvement_ci90": list(errors.interval),
+        "per_joint": {n: {"before": b, "after": a} for n, (b, a) in errors.per_joint.items()},
+        "per_motion": {n: {"before": b, "after": a} for n, (b, a) in errors.per_motion.items()},
+    }

@@ -1,0 +1,177 @@
+"""The whole diagnosis: from recordings to what the simulator leaves out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.evidence import Trace, threshold, traces
+from pup.diagnosis.fitting import differentiate
+from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.nominal import Nominal, fit_nominal
+from pup.diagnosis.regimes import Regime, regimes
+from pup.diagnosis.replays import Replays, Runner
+from pup.diagnosis.residuals import Measured, Noise, assumed_noise
+from pup.diagnosis.selection import Model, Round, Selector
+from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out
+from pup.physics.actuators import per_joint
+from pup.physics.parameters import robot_space
+from pup.recording import Recording
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+FALSE_ALARMS = 0.002
+"""Chance that pure noise makes any hypothesis stand out."""
+FEWEST = 60
+"""Samples below which nothing can be said."""
+MOTION = 0.02
+"""A joint that never moves by as much shows nothing, rad."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found, and all that it was found from.
+
+    Attributes:
+      robot: the robot.
+      verdict: whether something material is missing.
+      reason: why, where nothing can be said; empty else.
+      measured: the samples.
+      nominal: the nominal fit.
+      findings: what is missing, most important first.
+      held_out: errors on motions left out, before and after.
+      model: the nominal model with what was found.
+      rounds: how it came about.
+      found: traces of all hypotheses.
+      enough: surprise that chance does not reach.
+      regimes: the regimes of motion.
+      replays: candidates simulated.
+    """
+
+    robot: RobotDescription
+    verdict: Answer
+    reason: str
+    measured: Measured
+    nominal: Nominal
+    findings: tuple[Finding, ...]
+    held_out: HeldOut | None
+    model: Model | None
+    rounds: tuple[Round, ...]
+    found: tuple[Trace, ...]
+    enough: float
+    regimes: tuple[Regime, ...]
+    replays: int
+
+    @property
+    def noise(self) -> Noise:
+        """The noise of the channels."""
+        return self.nominal.noise
+
+
+def diagnose(
+    robot: RobotDescription,
+    recordings: Sequence[Recording],
+    runner: Callable[[Measured], Runner],
+    lanes: int,
+    progress: Progress,
+    seed: int = 0,
+) -> Diagnosis:
+    """Locate and name what the simulator of a robot leaves out.
+
+    Args:
+      robot: the robot, with the nominal actuator of CONTRACTS.md, section 2.
+      recordings: of that robot.
+      runner: makes what runs batches of replays.
+      lanes: how many run at once.
+      progress: told the stage and the share of all that is done.
+      seed: of everything random.
+    """
+    rng = np.random.default_rng(seed)
+    measured = Measured.of(robot, recordings)
+    replays = Replays(measured, robot_space(robot, "pd"), runner(measured), lanes)
+    progress("nominal fit", 0.0)
+    nominal = fit_nominal(replays, assumed_noise(measured), rng)
+    seen = _regimes(nominal, replays)
+
+    def told(verdict: Answer, reason: str = "", **more: Any) -> Diagnosis:
+        known: dict[str, Any] = {
+            "findings": (),
+            "held_out": None,
+            "model": None,
+            "rounds": (),
+            "found": (),
+            "enough": 0.0,
+        }
+        return Diagnosis(
+            robot=robot,
+            verdict=verdict,
+            reason=reason,
+            measured=measured,
+            nominal=nominal,
+            regimes=tuple(seen),
+            replays=replays.count,
+            **(known | more),
+        )
+
+    reason = _too_poor(measured)
+    if reason:
+        return told("undetermined", reason)
+    if not nominal.certificate.holds:
+        return told("undetermined", _unsettled(nominal))
+    progress("score test", 0.3)
+    found = traces(hypotheses(measured), nominal.fit, replays, nominal.noise)
+    if not found:
+        return told("undetermined", "the motions would not show any effect of the library")
+    enough = threshold(found, rng, FALSE_ALARMS)
+    selector = Selector(replays, nominal.noise, found, enough)
+    progress("refits", 0.5)
+    model, rounds = selector.run(nominal.fit)
+    evidence: dict[str, Any] = {"found": tuple(found), "enough": enough, "rounds": tuple(rounds)}
+    before = rounds[0].before if rounds else model
+    errors = held_out(measured, before, model, seed)
+    if not model.hypotheses:
+        return told("none", held_out=errors, model=model, **evidence)
+    progress("findings", 0.9)
+    differentiate([model.fit], replays, nominal.noise)
+    named = findings(model, rounds, selector, measured, seen)
+    return told("mismatch", findings=named, held_out=errors, model=model, **evidence)
+
+
+def _regimes(nominal: Nominal, replays: Replays) -> list[Regime]:
+    """The regimes of the nominal fit's motion."""
+    simulated = replays([nominal.fit.row()])[0]
+    measured, space = replays.measured, replays.space
+    values = space.at(nominal.fit.values).candidates()
+    limits, gains = (per_joint(measured.robot, values, kind)[0] for kind in ("tau_max", "kp"))
+    return regimes(measured, np.where(np.isnan(simulated), 0.0, simulated), limits, gains)
+
+
+def _too_poor(measured: Measured) -> str:
+    """Why the data can show nothing; empty where they may."""
+    if len(measured.values) < FEWEST:
+        return f"{len(measured.values)} readings are too few to tell anything"
+    reach = [
+        float(np.ptp(measured.values[measured.channel == j]))
+        for j in range(len(measured.robot.joints))
+        if (measured.channel == j).any()
+    ]
+    if max(reach, default=0.0) < MOTION:
+        return f"no joint moves by more than {MOTION:g} rad"
+    if len(measured.recordings) < 2:
+        return "one recording leaves nothing to check a finding on; record a second motion"
+    return ""
+
+
+def _unsettled(nominal: Nominal) -> str:
+    told = nominal.certificate
+    if not told.agree:
+        ends = ", ".join(f"{c:.1f}" for c in told.starts)
+        return f"the nominal fit does not settle: its starts end at chi-squared {ends}"
+    return (
+        "the nominal fit does not find itself again: a refit of its own simulation ends "
+        f"{told.recovered:.1f} standard deviations away"
+    )

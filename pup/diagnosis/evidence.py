@@ -1,0 +1,206 @@
+"""The score test: which effect, at which place, the nominal fit's errors look like.
+
+A hypothesis is simulated once, at a moderate size; what the nominal parameters can imitate of its
+trace is projected out of it; what is left is matched with the errors (a Lagrange-multiplier test).
+Matched filters find traces far below the noise. How large the largest of so many scores becomes by
+chance follows from the traces alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.hypotheses import MODERATE, Hypothesis
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Noise
+
+Array = NDArray[np.float64]
+
+SEEN = 1e-3
+"""A trace of which less than this share is left after projection cannot be told at all."""
+FAINT = 0.3
+"""A trace whose whitened length at typical size is below this is not worth a test."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What a hypothesis leaves in the samples.
+
+    Attributes:
+      hypothesis: of one effect, place and shape.
+      whole: whitened change of the samples per typical size, shape (n_samples, n_magnitudes).
+      left: what of it the nominal parameters cannot imitate.
+      basis: orthonormal columns that span `left`, shape (n_samples, n_seen).
+    """
+
+    hypothesis: Hypothesis
+    whole: Array
+    left: Array
+    basis: Array
+
+    @property
+    def absorbed(self) -> float:
+        """Share of the trace that nominal parameters imitate."""
+        whole = float(np.linalg.norm(self.whole))
+        return 1 - float(np.linalg.norm(self.left)) / whole if whole > 0 else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """How well a trace matches the errors.
+
+    Attributes:
+      trace: the trace.
+      statistic: drop of chi-squared it promises.
+      freedom: magnitudes that are seen.
+      sizes: magnitudes it asks for, in typical sizes.
+    """
+
+    trace: Trace
+    statistic: float
+    freedom: int
+    sizes: Array
+
+    @property
+    def surprise(self) -> float:
+        """The statistic as that of a single magnitude of the same improbability."""
+        tail = stats.chi2.logsf(self.statistic, self.freedom)
+        if self.freedom == 1:
+            return self.statistic
+        if tail < -300:  # beyond the table's end: what the extra magnitudes cost there
+            return float(self.statistic - (self.freedom - 1) * np.log(self.statistic))
+        return float(stats.chi2.isf(np.exp(tail), 1))
+
+
+class Projector:
+    """Takes out of traces what free parameters can imitate.
+
+    Args:
+      jacobian: whitened sensitivities, shape (n_samples, n_free).
+    """
+
+    def __init__(self, jacobian: Array) -> None:
+        lengths = np.linalg.norm(jacobian, axis=0)
+        scaled = jacobian / np.maximum(lengths, 1e-12)
+        left, spread, _ = np.linalg.svd(scaled, full_matrices=False)
+        self.basis = left[:, spread > 1e-4 * spread.max()]
+
+    def __call__(self, columns: Array) -> Array:
+        """What is left of columns (n_samples, n)."""
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns))
+
+
+def traces(
+    hypotheses: Sequence[Hypothesis],
+    base: Fit,
+    replays: Replays,
+    noise: Noise,
+) -> list[Trace]:
+    """Simulate hypotheses around a fit, all in one replay.
+
+    Args:
+      hypotheses: what to simulate.
+      base: a fit with its Jacobian.
+      replays: simulates.
+      noise: weighs the samples.
+    """
+    assert base.jacobian is not None
+    here = base.row()
+    rows = [{**here, **probe} for h in hypotheses for probe in h.probes()]
+    simulated = replays([here, *rows])
+    changes = replays.measured.whiten(simulated[1:] - simulated[0], noise)
+    project = Projector(base.jacobian)
+    out, next_row = [], 0
+    for hypothesis in hypotheses:
+        count = len(hypothesis.magnitudes)
+        part = changes[next_row : next_row + count].T
+        next_row += count
+        trace = _trace(hypothesis, part, project)
+        if trace is not None:
+            out.append(trace)
+    return out
+
+
+def _trace(hypothesis: Hypothesis, change: Array, project: Projector) -> Trace | None:
+    """The trace of a hypothesis; None where the data cannot show it."""
+    whole = change / MODERATE
+    return _seen(hypothesis, whole, project) if np.isfinite(whole).all() else None
+
+
+def _seen(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | None:
+    left = project(whole)
+    vectors, lengths, _ = np.linalg.svd(left, full_matrices=False)
+    seen = (lengths > FAINT) & (lengths > SEEN * np.linalg.norm(whole))
+    return Trace(hypothesis, whole, left, vectors[:, seen]) if seen.any() else None
+
+
+def project_again(found: Sequence[Trace], project: Projector) -> list[Trace]:
+    """Traces as seen beside other free parameters than those they were simulated with."""
+    told = (_seen(trace.hypothesis, trace.whole, project) for trace in found)
+    return [trace for trace in told if trace is not None]
+
+
+def scores(found: Sequence[Trace], residual: Array) -> list[Score]:
+    """Match traces with errors, best first.
+
+    Args:
+      found: the traces.
+      residual: whitened, measured minus simulated, shape (n_samples,).
+    """
+    told = []
+    for trace in found:
+        match = trace.basis.T @ residual
+        statistic, sizes = float(match @ match), _sizes(trace, residual)
+        if not trace.hypothesis.signed and sizes[0] < 0:
+            statistic = 0.0
+        told.append(Score(trace, statistic, trace.basis.shape[1], sizes))
+    return sorted(told, key=lambda s: -s.surprise)
+
+
+def _sizes(trace: Trace, residual: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(trace.left, residual, rcond=1e-3)[0])
+
+
+def threshold(
+    found: Sequence[Trace], rng: np.random.Generator, false_alarms: float, draws: int = 4000
+) -> float:
+    """Surprise that the largest score exceeds by chance with a given probability.
+
+    Pure noise is drawn as its products with the traces, whose covariance is that of the traces.
+
+    Args:
+      found: all traces.
+      rng: draws the noise.
+      false_alarms: probability that any of them exceeds it.
+      draws: how many times.
+    """
+    basis = np.hstack([t.basis for t in found])
+    gram = basis.T @ basis
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    products = root @ rng.normal(size=(len(root), draws))
+    largest = np.zeros(draws)
+    start = 0
+    for trace in found:
+        width = trace.basis.shape[1]
+        part = products[start : start + width]
+        start += width
+        statistic = (part**2).sum(axis=0)
+        if not trace.hypothesis.signed:
+            statistic = np.where(part[0] < 0, 0.0, statistic)
+        if width > 1:
+            statistic = stats.chi2.isf(stats.chi2.sf(statistic, width), 1)
+        np.maximum(largest, statistic, out=largest)
+    # The tail of a largest of many is exponential: its far end from its near one.
+    near = float(np.quantile(largest, 0.9))
+    excess = float(np.mean(largest[largest > near] - near))
+    return near + excess * float(np.log(0.1 / false_alarms))
+
+
+def overlap(a: Trace, b: Trace) -> float:
+    """Share of one trace's direction that another can imitate, 0 to 1, at their typical sizes."""
+    return float(np.linalg.norm(a.basis.T @ b.basis, 2)) if a.basis.size and b.basis.size else 0.0

@@ -1,0 +1,285 @@
+"""Many least-squares fits at once: each step of all of them is one replay.
+
+A fit moves its own parameters in coordinates of order one: the logarithm of what is positive, and
+an effect's magnitudes in their typical sizes. Jacobians by differences are refreshed only where
+Broyden's update of them leads no further, as a replay is all the cost there is.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import LOST, Noise
+from pup.physics.parameters import ParameterSpace
+from pup.physics.terms import TERMS, split_column
+from pup.physics.terms.scale import Scale
+
+Array = NDArray[np.float64]
+
+STEP = 0.004
+"""Finite-difference step, of a coordinate."""
+DAMPINGS = (0.1, 1.0, 10.0)
+"""Tried at once, relative to the current one."""
+ENOUGH = 0.05
+"""A fit has ended when no step lowers chi-squared by as much."""
+ALMOST = 1e-9
+PATIENCE = 2
+"""Accepted steps for which an updated Jacobian is trusted."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One free parameter and the coordinate it is fitted in.
+
+    Attributes:
+      name: the parameter.
+      scale: its size at coordinate 1, in its unit; None where the coordinate is its logarithm.
+      lower: smallest coordinate.
+      upper: largest coordinate.
+    """
+
+    name: str
+    scale: float | None
+    lower: float
+    upper: float
+
+    def value(self, coordinate: float) -> float:
+        """The parameter, in its unit."""
+        return float(np.exp(coordinate) if self.scale is None else coordinate * self.scale)
+
+    def coordinate(self, value: float) -> float:
+        """Where a value lies."""
+        told = np.log(max(value, 1e-300)) if self.scale is None else value / self.scale
+        return float(np.clip(told, self.lower, self.upper))
+
+    def slope(self, coordinate: float) -> float:
+        """The parameter's change per change of the coordinate."""
+        return float(np.exp(coordinate)) if self.scale is None else self.scale
+
+
+def nominal_coordinate(space: ParameterSpace, name: str) -> Coordinate:
+    """The coordinate of a nominal parameter, which is positive."""
+    i = space.names.index(name)
+    low = max(space.lower[i], 1e-4 * space.upper[i])
+    return Coordinate(name, None, float(np.log(low)), float(np.log(space.upper[i])))
+
+
+def term_coordinate(name: str, scale: Scale) -> Coordinate:
+    """The coordinate of a term's quantity on a robot of some strength."""
+    told = split_column(name)
+    assert told is not None
+    quantity = next(q for q in TERMS[told[0]].quantities if q.name == told[1])
+    factor = scale.factor(quantity.unit)
+    if quantity.shape:
+        lower, upper = np.log(quantity.lower * factor), np.log(quantity.limit * factor)
+        return Coordinate(name, None, float(lower), float(upper))
+    return Coordinate(
+        name,
+        quantity.typical * factor,
+        quantity.lower / quantity.typical,
+        quantity.limit / quantity.typical,
+    )
+
+
+@dataclass
+class Fit:
+    """A least-squares fit under way.
+
+    Attributes:
+      coordinates: what is free.
+      at: where it stands, shape (n_free,).
+      fixed: other parameters that differ from their nominal values.
+      weight: of the samples, shape (n_samples,): 0 leaves one out.
+      data: what it fits, shape (n_samples,), rad; None for what was measured.
+      residual: whitened, measured minus simulated, shape (n_samples,).
+      jacobian: of the simulated samples, whitened, shape (n_samples, n_free).
+      chi2: sum of squared weighted residuals.
+      done: whether no step leads further.
+      thorough: whether it ends on a Jacobian of where it stands, not on an updated one.
+      damping: of Levenberg and Marquardt.
+      age: steps since the Jacobian was fresh.
+      stuck: times in a row that no trial was better.
+    """
+
+    coordinates: tuple[Coordinate, ...]
+    at: Array
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    weight: Array | None = None
+    data: Array | None = None
+    residual: Array | None = None
+    jacobian: Array | None = None
+    chi2: float = np.inf
+    done: bool = False
+    thorough: bool = True
+    damping: float = 1e-2
+    age: int = 0
+    stuck: int = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(c.name for c in self.coordinates)
+
+    def row(self, at: Array | None = None) -> dict[str, float]:
+        """The candidate at some coordinates; where the fit stands when none are given."""
+        where = self.at if at is None else at
+        free = {c.name: c.value(x) for c, x in zip(self.coordinates, where, strict=True)}
+        return {**self.fixed, **free}
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters that are not nominal."""
+        return self.row()
+
+    def covariance(self) -> Array:
+        """Of the coordinates, shape (n_free, n_free); what the data do not see has its range."""
+        assert self.jacobian is not None
+        weighted = self.jacobian if self.weight is None else self.jacobian * self.weight[:, None]
+        span = np.array([c.upper - c.lower for c in self.coordinates])
+        return np.asarray(np.linalg.inv(weighted.T @ weighted + np.diag(12 / span**2)))
+
+
+def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations: int = 12) -> None:
+    """Move some fits to their minima, in step.
+
+    Args:
+      fits: changed in place. One without a residual is replayed first; one with a Jacobian starts
+        with it.
+      replays: simulates.
+      noise: weighs the samples.
+      iterations: at most this many steps of each.
+    """
+    _evaluate([fit for fit in fits if fit.residual is None], replays, noise)
+    for _ in range(iterations):
+        moving = [fit for fit in fits if not fit.done]
+        if not moving:
+            return
+        differentiate([fit for fit in moving if fit.jacobian is None], replays, noise)
+        trials = [(fit, at) for fit in moving for at in _trials(fit)]
+        if not trials:
+            return
+        simulated = replays([fit.row(at) for fit, at in trials])
+        reached = _residuals([fit for fit, _ in trials], simulated, replays, noise)
+        for fit in moving:
+            mine = [i for i, (owner, _) in enumerate(trials) if owner is fit]
+            _take(fit, [(trials[i][1], reached[i]) for i in mine])
+
+
+def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Give some fits fresh Jacobians where they stand."""
+    moved = [(fit, i) for fit in fits for i in range(len(fit.coordinates))]
+    if not moved:
+        return
+    steps = [_step(fit, i) for fit, i in moved]
+    points = []
+    for (fit, i), step in zip(moved, steps, strict=True):
+        at = fit.at.copy()
+        at[i] += step
+        points.append(fit.row(at))
+    values = _residuals([fit for fit, _ in moved], replays(points), replays, noise)
+    for fit in fits:
+        assert fit.residual is not None
+        columns = [
+            (fit.residual - value) / step
+            for (owner, _), step, value in zip(moved, steps, values, strict=True)
+            if owner is fit
+        ]
+        fit.jacobian = np.stack(columns, axis=1)
+        fit.age = 0
+
+
+def _evaluate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    if not fits:
+        return
+    values = _residuals(fits, replays([fit.row() for fit in fits]), replays, noise)
+    for fit, value in zip(fits, values, strict=True):
+        fit.residual, fit.chi2 = value, _chi2(fit, value)
+
+
+def _residuals(fits: Sequence[Fit], simulated: Array, replays: Replays, noise: Noise) -> Array:
+    """Whitened errors of one row for each fit."""
+    measured = replays.measured
+    data = np.stack([measured.values if f.data is None else f.data for f in fits])
+    errors = data - np.where(np.isnan(simulated), data + LOST, simulated)
+    return measured.whiten(errors, noise)
+
+
+def _chi2(fit: Fit, residual: Array) -> float:
+    weighted = residual if fit.weight is None else residual * fit.weight
+    return float(weighted @ weighted)
+
+
+def _step(fit: Fit, i: int) -> float:
+    """A finite difference into the range."""
+    coordinate = fit.coordinates[i]
+    step = STEP if coordinate.scale is None else 5 * STEP
+    return step if fit.at[i] + step <= coordinate.upper else -step
+
+
+def _trials(fit: Fit) -> list[Array]:
+    """Where damped Gauss-Newton steps lead."""
+    assert fit.jacobian is not None and fit.residual is not None
+    weight = 1.0 if fit.weight is None else fit.weight[:, None]
+    jacobian = fit.jacobian * weight
+    residual = fit.residual if fit.weight is None else fit.residual * fit.weight
+    lower = np.array([c.lower for c in fit.coordinates])
+    upper = np.array([c.upper for c in fit.coordinates])
+    normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+    scale = np.maximum(np.diag(normal), 1e-6 * max(float(np.diag(normal).max()), 1e-300))
+    points = []
+    for factor in DAMPINGS:
+        system = normal + factor * fit.damping * np.diag(scale)
+        points.append(_bounded(system, gradient, fit.at, lower, upper))
+    return points
+
+
+def _bounded(system: Array, gradient: Array, at: Array, lower: Array, upper: Array) -> Array:
+    """A Newton step that stays in its box; what hits a wall stays there."""
+    free = np.ones(len(at), dtype=bool)
+    step = np.zeros(len(at))
+    for _ in range(len(at)):
+        step[free] = np.linalg.solve(
+            system[np.ix_(free, free)], gradient[free] - system[np.ix_(free, ~free)] @ step[~free]
+        )
+        out = free & ((at + step < lower - ALMOST) | (at + step > upper + ALMOST))
+        if not out.any():
+            break
+        step[out] = np.clip(at + step, lower, upper)[out] - at[out]
+        free &= ~out
+        if not free.any():
+            break
+    return np.clip(at + step, lower, upper)
+
+
+def _take(fit: Fit, reached: Sequence[tuple[Array, Array]]) -> None:
+    """Go where a trial is best, or ask for a fresh Jacobian, or stop."""
+    costs = [_chi2(fit, residual) for _, residual in reached]
+    best = int(np.argmin(costs))
+    gain = fit.chi2 - costs[best]
+    fresh = fit.age == 0
+    if gain > 0:
+        at, residual = reached[best]
+        assert fit.jacobian is not None and fit.residual is not None
+        moved = at - fit.at
+        miss = (fit.residual - residual) - fit.jacobian @ moved
+        length = float(moved @ moved)
+        if length > 0:  # Broyden's update
+            fit.jacobian = fit.jacobian + np.outer(miss, moved) / length
+        fit.at, fit.residual, fit.chi2 = at, residual, costs[best]
+        fit.damping = float(np.clip(fit.damping * DAMPINGS[best], 1e-6, 1e6))
+        fit.age += 1
+        fit.stuck = 0
+    if gain > max(ENOUGH, 1e-5 * fit.chi2):
+        if fit.age >= PATIENCE and fit.thorough:
+            fit.jacobian = None
+    elif gain <= 0 and fit.stuck < 2:
+        fit.damping *= 30
+        fit.stuck += 1
+    elif fresh or not fit.thorough:
+        fit.done = True
+    else:
+        fit.jacobian = None
+        fit.stuck = 0

@@ -1,0 +1,178 @@
+"""What could be missing: every effect of the physics library at every place the data can show."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.residuals import Measured
+from pup.physics.model import compile_model
+from pup.physics.terms import CLASS_OF, TERMS, Place, column
+from pup.physics.terms.scale import Scale
+
+MODERATE = 0.5
+"""A hypothesis is first looked at in this share of its typical size."""
+NOT_ALONE = frozenset(("external_force",))
+"""Effects of a wrench need the ground: a torso that is fixed does not feel one."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One effect at one place, with the shape it is first tried in.
+
+    Attributes:
+      effect: its name.
+      place: where it acts.
+      scale: of the robot.
+      shape: values of its shape quantities, by column.
+    """
+
+    effect: str
+    place: Place
+    scale: Scale
+    shape: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def family(self) -> str:
+        """The class of effects that scoring treats as one."""
+        return CLASS_OF[self.effect]
+
+    @property
+    def key(self) -> tuple[str, Place]:
+        """What it claims, whatever its shape."""
+        return self.effect, self.place
+
+    @cached_property
+    def magnitudes(self) -> tuple[str, ...]:
+        """Columns that are zero where it is absent."""
+        return tuple(
+            column(self.effect, q.name, self.place) for q in TERMS[self.effect].magnitudes()
+        )
+
+    @cached_property
+    def typical(self) -> tuple[float, ...]:
+        """Typical sizes of the magnitudes, in their units."""
+        return tuple(q.typical * self.scale.factor(q.unit) for q in TERMS[self.effect].magnitudes())
+
+    @cached_property
+    def signed(self) -> bool:
+        """Whether its one magnitude may be negative; true where it has several."""
+        sizes = TERMS[self.effect].magnitudes()
+        return len(sizes) > 1 or sizes[0].signed
+
+    @cached_property
+    def continuous(self) -> tuple[str, ...]:
+        """Columns of shapes that a refit may move: those that are not a choice of two."""
+        return tuple(
+            column(self.effect, q.name, self.place)
+            for q in TERMS[self.effect].quantities
+            if q.shape and not _choice(q.grid)
+        )
+
+    def row(self, sizes: Mapping[str, float] | None = None) -> dict[str, float]:
+        """The term's columns, at given magnitudes or at moderate ones."""
+        given = sizes or {
+            n: MODERATE * t for n, t in zip(self.magnitudes, self.typical, strict=True)
+        }
+        return {**dict(self.shape), **given}
+
+    def probes(self) -> list[dict[str, float]]:
+        """One row for each magnitude alone, at a moderate size."""
+        return [
+            self.row({name: MODERATE * typical})
+            for name, typical in zip(self.magnitudes, self.typical, strict=True)
+        ]
+
+
+def hypotheses(measured: Measured) -> list[Hypothesis]:
+    """All hypotheses about some measurements."""
+    scale = Scale.of(measured.robot)
+    return [
+        Hypothesis(effect, place, scale, shape)
+        for effect in TERMS
+        for place in _places(effect, measured)
+        for shape in _shapes(effect, place, measured, scale)
+    ]
+
+
+def _shapes(
+    effect: str, place: Place, measured: Measured, scale: Scale
+) -> Iterator[tuple[tuple[str, float], ...]]:
+    """Combinations of shape values to look at."""
+    if effect == "joint_stop":
+        yield from _stops(place, measured)
+        return
+    quantities = [q for q in TERMS[effect].quantities if q.shape]
+    for values in product(*(q.grid for q in quantities)):
+        yield tuple(
+            (column(effect, q.name, place), v * scale.factor(q.unit))
+            for q, v in zip(quantities, values, strict=True)
+        )
+
+
+def _stops(place: Place, measured: Measured) -> Iterator[tuple[tuple[str, float], ...]]:
+    """Stops just inside the ends of where a joint has been."""
+    joint = measured.robot.joint_names.index(place.name)
+    visited = measured.values[measured.channel == joint]
+    if not len(visited):
+        return
+    for side, quantile in ((-1.0, 0.03), (1.0, 0.97)):
+        angle = column("joint_stop", "angle", place), float(np.quantile(visited, quantile))
+        yield angle, (column("joint_stop", "side", place), side)
+
+
+def _places(effect: str, measured: Measured) -> Iterator[Place]:
+    """Places where an effect would show."""
+    robot, kinds = measured.robot, TERMS[effect].kinds
+    ground = any(r.support == "ground" for r in measured.recordings)
+    one = len(robot.joints) == 1
+    for kind in kinds:
+        if kind == "joint":
+            yield from (Place("joint", name) for name in robot.joint_names)
+        elif kind == "group":
+            members = np.bincount(robot.group_index, minlength=len(robot.groups))
+            yield from (
+                Place("group", g) for g, n in zip(robot.groups, members, strict=True) if n > 1
+            )
+        elif kind == "body":
+            yield from _bodies(effect, measured, ground)
+        elif kind in ("ground", "sensor", "foot") and ground:
+            names = robot.feet if kind == "foot" else ("",)
+            yield from (Place(kind, name) for name in names)
+        elif kind in ("bus", "robot") and (not one or kinds == (kind,)):
+            yield Place(kind)
+
+
+def _bodies(effect: str, measured: Measured, ground: bool) -> Iterator[Place]:
+    """Bodies whose motion the data can show: links that joints move, and a free torso."""
+    robot = measured.robot
+    supports = {r.support for r in measured.recordings}
+    model = compile_model(robot, "ground" if ground else next(iter(supports))).compiled
+    carried = [int(model.joint(name).bodyid[0]) for name in robot.joint_names]
+    if effect == "structural_flex":
+        yield from (Place("body", model.body(b).name) for b in dict.fromkeys(carried))
+        return
+    if effect in NOT_ALONE:
+        if ground and robot.torso:
+            yield Place("body", robot.torso)
+        return
+    for body in range(1, model.nbody):
+        moved = body in carried or any(_is_below(model.body_parentid, body, c) for c in carried)
+        free = ground and model.body(body).name == robot.torso
+        if (moved or free) and model.body_mass[body] > 0.01:
+            yield Place("body", model.body(body).name)
+
+
+def _is_below(parents: NDArray[np.int32], body: int, ancestor: int) -> bool:
+    while body:
+        body = int(parents[body])
+        if body == ancestor:
+            return True
+    return False
+
+
+def _choice(grid: tuple[float, ...]) -> bool:
+    return len(grid) == 2

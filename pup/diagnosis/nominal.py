@@ -1,0 +1,138 @@
+"""The nominal model's fit, and whether it may be trusted.
+
+An optimiser that stops short looks exactly like missing physics. So the fit is made from several
+starts, which must agree, and of a simulation of itself, whose parameters it must find again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.fitting import Coordinate, Fit, differentiate, fit_together, nominal_coordinate
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Noise, noise_floor
+from pup.physics.parameters import ParameterSpace
+
+Array = NDArray[np.float64]
+
+STARTS = 3
+SPREAD = 0.35
+"""Of the starts around the nominal values, in logarithms."""
+AGREEMENT = 1e-3
+"""Two starts agree in chi-squared to this share of it, or to ABSOLUTE."""
+ABSOLUTE = 2.0
+REPEATS = 3
+"""How often starts that disagree are taken further."""
+SELF = 3.0
+"""A refit of the fit's own simulation may be off by so many standard deviations."""
+FREE = ("kp", "kd", "tau_max", "armature", "ground_friction")
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Whether the nominal fit has converged.
+
+    Attributes:
+      starts: chi-squared from each start.
+      agree: whether at least two of the best agree.
+      recovered: largest error of a refit of its own simulation, in standard deviations.
+    """
+
+    starts: tuple[float, ...]
+    agree: bool
+    recovered: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether a verdict may be given."""
+        return self.agree and self.recovered <= SELF
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """The nominal model fitted.
+
+    Attributes:
+      fit: with its Jacobian.
+      noise: the noise floor that it leads to.
+      certificate: whether it has converged.
+    """
+
+    fit: Fit
+    noise: Noise
+    certificate: Certificate
+
+
+def free_names(space: ParameterSpace, ground: bool) -> tuple[str, ...]:
+    """What the nominal fit may move (CONTRACTS.md, section 2)."""
+    return tuple(
+        name
+        for name in space.names
+        if name.split("/")[0] in FREE and (ground or name != "ground_friction") and "@" not in name
+    )
+
+
+def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nominal:
+    """Fit the nominal parameters from several starts, with noise as it then appears.
+
+    Args:
+      replays: simulates.
+      first: noise to begin with.
+      rng: draws the starts.
+    """
+    measured = replays.measured
+    ground = any(r.support == "ground" for r in measured.recordings)
+    space = replays.space
+    coordinates = tuple(nominal_coordinate(space, n) for n in free_names(space, ground))
+    rough = _fit(coordinates, space, 0.0, rng, thorough=False)
+    fit_together([rough], replays, first, iterations=6)
+    assert rough.residual is not None
+    noise = noise_floor(measured, measured.values - replays([rough.row()])[0])
+    fits = [_fit(coordinates, space, SPREAD, rng) for _ in range(STARTS - 1)]
+    fits.append(Fit(coordinates, rough.at.copy()))
+    fit_together(fits, replays, noise)
+    for _ in range(REPEATS):
+        best, second = sorted(fits, key=lambda fit: fit.chi2)[:2]
+        if _agree(best.chi2, second.chi2):
+            break
+        for fit in (best, second):  # kinks stop a fit short; a fresh start leads over them
+            fit.done, fit.jacobian, fit.damping = False, None, 1e-3
+        fit_together([best, second], replays, noise, iterations=6)
+    best = min(fits, key=lambda fit: fit.chi2)
+    if best.jacobian is None:
+        differentiate([best], replays, noise)
+    own = _refit_of_itself(best, replays, noise, rng)
+    chi2 = tuple(sorted(fit.chi2 for fit in fits))
+    return Nominal(best, noise, Certificate(chi2, _agree(*chi2[:2]), own))
+
+
+def _agree(best: float, second: float) -> bool:
+    return second - best <= max(AGREEMENT * best, ABSOLUTE)
+
+
+def _fit(
+    coordinates: Sequence[Coordinate],
+    space: ParameterSpace,
+    spread: float,
+    rng: np.random.Generator,
+    thorough: bool = True,
+) -> Fit:
+    at = [
+        c.coordinate(space.nominal[space.names.index(c.name)]) + spread * rng.normal()
+        for c in coordinates
+    ]
+    low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
+    return Fit(tuple(coordinates), np.clip(at, low, high), thorough=thorough)
+
+
+def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator) -> float:
+    """How far a fit of its own simulation ends from it, in standard deviations."""
+    deviation = np.sqrt(np.diag(fit.covariance()))
+    away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
+    low, high = ([getattr(c, end) for c in fit.coordinates] for end in ("lower", "upper"))
+    start = np.clip(fit.at + away, low, high)
+    own = Fit(fit.coordinates, start, data=replays([fit.row()])[0], jacobian=fit.jacobian, age=1)
+    fit_together([own], replays, noise, iterations=8)
+    return float(np.max(np.abs(own.at - fit.at) / deviation))

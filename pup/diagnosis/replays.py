@@ -1,0 +1,186 @@
+"""Rows of named parameters in, whitenable samples out: all that diagnosis asks of a simulator.
+
+Rows that put different effects into the simulation go into different batches, so that each batch
+computes only the terms it needs. Where batches run, in threads or on a cluster, is the caller's.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.residuals import Measured
+from pup.physics.mujoco_batch import MujocoSimulator
+from pup.physics.parameters import Candidates, ParameterSpace
+from pup.physics.push import Push
+from pup.physics.terms import Place, split_column, term_space
+
+Array = NDArray[np.float64]
+Row = Mapping[str, float]
+"""Parameters by name; those not named have their nominal values."""
+
+BATCH = 384
+"""Simulations in a batch, at most."""
+WORTH = 60
+"""Simulations that are worth a batch of their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Candidates that are replayed together.
+
+    Attributes:
+      rows: where they stand among all.
+      candidates: their parameters.
+      recordings: which recordings are replayed.
+      push: torques from outside.
+    """
+
+    rows: NDArray[np.int64]
+    candidates: Candidates
+    recordings: tuple[int, ...]
+    push: Push | None = None
+
+
+@dataclass(eq=False)
+class Bench:
+    """Replays batches in this process; a worker has one of its own.
+
+    Attributes:
+      measured: what is replayed.
+      actuator: torque law of the nominal model.
+    """
+
+    measured: Measured
+    actuator: str = "pd"
+    _simulators: dict[tuple[int, ...], tuple[MujocoSimulator, Measured]] = field(
+        default_factory=dict, repr=False
+    )
+
+    def run(self, batch: Batch) -> Array:
+        """Samples of a batch, shape (n_rows, n_samples of its recordings), rad."""
+        simulator, measured = self.simulator(batch.recordings)
+        return measured.pick(simulator.replay(batch.candidates, batch.push))
+
+    def simulator(self, recordings: tuple[int, ...]) -> tuple[MujocoSimulator, Measured]:
+        """The simulator of some recordings and their samples."""
+        if recordings not in self._simulators:
+            chosen = [self.measured.recordings[i] for i in recordings]
+            part = Measured.of(self.measured.robot, chosen)
+            simulator = MujocoSimulator(part.robot, part.recordings, self.actuator)
+            self._simulators[recordings] = simulator, part
+        return self._simulators[recordings]
+
+
+Runner = Callable[[Sequence[Batch]], list[Array]]
+"""Runs batches wherever there are cores, and returns their samples in order."""
+
+
+def threads(bench: Bench, count: int) -> Runner:
+    """A runner in threads of this process."""
+
+    def run(batches: Sequence[Batch]) -> list[Array]:
+        for batch in batches:
+            bench.simulator(batch.recordings)
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(bench.run, batches))
+
+    return run
+
+
+class Replays:
+    """Replays rows of parameters against one set of measurements.
+
+    Args:
+      measured: what was measured.
+      space: the nominal model's parameters.
+      runner: runs the batches.
+      lanes: how many batches run at once.
+    """
+
+    def __init__(
+        self, measured: Measured, space: ParameterSpace, runner: Runner, lanes: int
+    ) -> None:
+        self.measured = measured
+        self.space = space
+        self.runner = runner
+        self.lanes = lanes
+        self.count = 0
+        """Candidates replayed, one for each pass over all recordings."""
+
+    def __call__(
+        self,
+        rows: Sequence[Row],
+        recordings: Sequence[int] | None = None,
+        push: Push | None = None,
+    ) -> Array:
+        """Simulated samples, shape (n_rows, n_samples), rad; NaN where a simulation diverged.
+
+        Args:
+          rows: the candidates.
+          recordings: replay these only; the samples are theirs.
+          push: torques from outside on each row and recording.
+        """
+        every = range(len(self.measured.recordings))
+        chosen = tuple(every if recordings is None else recordings)
+        self.count += len(rows)
+        batches = self._batches(rows, chosen, push)
+        samples = int(self.measured.only(chosen).sum())
+        out = np.empty((len(rows), samples))
+        for batch, values in zip(batches, self.runner(batches), strict=True):
+            out[batch.rows] = values
+        return out
+
+    def _batches(
+        self, rows: Sequence[Row], recordings: tuple[int, ...], push: Push | None
+    ) -> list[Batch]:
+        effects = [_effects(row) for row in rows]
+        order = np.array(sorted(range(len(rows)), key=effects.__getitem__), dtype=np.int64)
+        most = max(1, BATCH // len(recordings))
+        worth = max(
+            1, len(rows) * len(recordings) // WORTH
+        )  # small batches cost more than they save
+        parts = max(min(self.lanes, worth), -(-len(rows) // most))
+        return [
+            Batch(
+                part,
+                self._candidates([rows[i] for i in part]),
+                recordings,
+                None if push is None else replace(push, values=push.values[part]),
+            )
+            for part in np.array_split(order, min(parts, len(rows)))
+        ]
+
+    def _candidates(self, rows: Sequence[Row]) -> Candidates:
+        space = union(self.space, rows)
+        index = {name: i for i, name in enumerate(space.names)}
+        values = np.tile(space.nominal, (len(rows), 1))
+        for number, row in enumerate(rows):
+            for name, value in row.items():
+                values[number, index[name]] = value
+        return space.candidates(values)
+
+
+def union(space: ParameterSpace, rows: Sequence[Row]) -> ParameterSpace:
+    """A space with the columns of all terms that some rows name."""
+    extra: dict[tuple[str, Place], None] = {}
+    for row in rows:
+        for name in row:
+            told = split_column(name)
+            if told is not None and name not in space.names:
+                extra[told[0], told[2]] = None
+    spaces = [space, *(term_space(effect, place) for effect, place in extra)]
+    return ParameterSpace(
+        sum((s.names for s in spaces), ()),
+        sum((s.units for s in spaces), ()),
+        *(
+            np.concatenate([getattr(s, key) for s in spaces])
+            for key in ("nominal", "lower", "upper")
+        ),
+    )
+
+
+def _effects(row: Row) -> tuple[str, ...]:
+    return tuple(sorted({name.partition("/")[0] for name in row if "@" in name}))

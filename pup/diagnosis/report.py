@@ -1,0 +1,323 @@
+"""The report of a diagnosis: one page that needs nothing but itself."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pup.diagnosis import report_errors, report_evidence, report_fit, summary
+from pup.diagnosis.drawing import MARKS, draw_robot
+from pup.diagnosis.engine import Diagnosis
+from pup.diagnosis.laws import WORDS
+from pup.diagnosis.sentences import sentence
+from pup.diagnosis.verdict import Finding
+from pup.diagnosis.wording import Speech, capital, minus, percent, quantity_words
+from pup.files import write_atomic
+from pup.sysid.accuracy import JointUnits
+from pup.sysid.figures import drawing_style
+from pup.sysid.html import Column, Html, figure, page, table, tag
+from pup.sysid.wording import counted, flattened, listed, recordings_words
+
+SURE = 0.7
+"""A finding less probable than this is told as the likeliest of several."""
+LEFT = 1.3
+"""An error of more than so many times the noise is too much for noise."""
+NEXT = "next_recording"
+BADGE = "color: #fff; border-radius: 1em; padding: 0 0.5em; margin-right: 0.5em;"
+"""Looks of a finding's number."""
+
+
+def write_report(diagnosis: Diagnosis, path: Path, provenance: Mapping[str, Any]) -> None:
+    """Write `report.html`, whole or not at all.
+
+    Args:
+      diagnosis: what was found.
+      path: the file.
+      provenance: how it came about, as JSON values; under `next_recording` what to record next,
+        with `motion`, `reason` and `splits`, if anything.
+    """
+    with drawing_style():
+        content = _Report(diagnosis, provenance).content()
+        write_atomic(path, page(f"Diagnosis of {diagnosis.robot.name}", *content))
+
+
+class _Report:
+    def __init__(self, diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> None:
+        self.diagnosis = diagnosis
+        units = JointUnits.of(diagnosis.robot, diagnosis.measured.recordings)
+        self.speech = Speech(diagnosis.robot, units)
+        self.provenance = {k: v for k, v in provenance.items() if k != NEXT}
+        self.next: Mapping[str, Any] = provenance.get(NEXT) or {}
+        self.sentences = [sentence(diagnosis, f, self.speech) for f in diagnosis.findings]
+
+    def content(self) -> Iterator[Html]:
+        """The page's body; a section with nothing to say is left out."""
+        case = (self.diagnosis, self.speech)
+        sections: dict[str, Callable[[], Iterator[Html]]] = {
+            "What is missing": self.missing,
+            "Where": self.where,
+            "Before and after" if case[0].findings else "Errors on motions left out": lambda: (
+                report_errors.before_and_after(*case)
+            ),
+            "When the model is off": lambda: report_errors.maps(*case),
+            "Evidence": lambda: report_evidence.evidence(*case),
+            "What could hide": lambda: report_evidence.hiding(*case),
+            "What to record next": self.record_next,
+            "The nominal fit": lambda: report_fit.nominal(*case),
+            "Provenance": self.came_about,
+        }
+        told = {title: list(section()) for title, section in sections.items()}
+        told = {title: parts for title, parts in told.items() if parts}
+        ids = {title: title.lower().replace(" ", "-") for title in told}
+        yield from self.headline()
+        links = (tag("li", tag("a", title, href=f"#{name}")) for title, name in ids.items())
+        yield tag("nav", tag("ul", *links), aria_label="Contents")
+        for title, parts in told.items():
+            yield tag("section", tag("h2", title), *parts, id=ids[title])
+
+    def headline(self) -> Iterator[Html]:
+        """The verdict in plain words."""
+        diagnosis = self.diagnosis
+        count = recordings_words(diagnosis.measured.recordings)
+        yield tag("p", f"Diagnosis of {diagnosis.robot.name}, from {count}", class_="lead")
+        yield tag("h1", self.title())
+        if len(self.sentences) > 1:
+            items = (tag("li", text) for text in self.sentences)
+            yield tag("ol", *items, style="font-size: 1.15rem")
+        for words in {"mismatch": self.hid, "none": self.nothing, "undetermined": self.unclear}[
+            diagnosis.verdict
+        ]():
+            yield tag("p", words)
+        yield tag("dl", *(_fact(*fact) for fact in self.facts()), class_="facts")
+
+    def title(self) -> str:
+        """The verdict in one sentence."""
+        diagnosis, findings = self.diagnosis, self.diagnosis.findings
+        if diagnosis.verdict == "undetermined":
+            return "These recordings cannot tell whether anything is missing."
+        if diagnosis.verdict == "none":
+            if self.left() > LEFT:
+                return (
+                    "No known effect is missing, but the simulator is off by "
+                    f"{self.left():.1f} times the noise."
+                )
+            least = self.error(summary.smallest_material(diagnosis))
+            return f"Nothing material is missing from the simulator beyond {least}."
+        if len(findings) > 1:
+            return f"The simulator lacks {len(findings)} effects."
+        unsure = "Most likely: " if findings and findings[0].probability < SURE else ""
+        return unsure + " ".join(self.sentences)
+
+    def error(self, value: float) -> str:
+        """An error as `2.1 mrad (0.12°)`."""
+        return self.speech.units.words(value)
+
+    def left(self) -> float:
+        """What the final model leaves of motions left out, in units of the noise."""
+        model = self.diagnosis.model
+        return summary.left_over(self.diagnosis, model) if model else float("nan")
+
+    def hid(self) -> Iterator[str]:
+        """Where a mismatch hid and what naming it is worth."""
+        diagnosis = self.diagnosis
+        it = "it" if len(diagnosis.findings) == 1 else "them"
+        shifts = self.speech.shifts(diagnosis.findings[0].absorbed_by) if diagnosis.findings else ""
+        hidden = f"Your fit hid {it} in the {shifts}. " if shifts else ""
+        if diagnosis.held_out is None:
+            yield hidden
+            return
+        held = diagnosis.held_out
+        low, high = (percent(end) for end in held.interval)
+        yield minus(
+            f"{hidden}With {it}, the error on motions that the fit had not seen falls from "
+            f"{self.error(held.before)} to {self.error(held.after)}: by "
+            f"{percent(1 - held.after / held.before)} (90 % interval {low} to {high})."
+        )
+        if self.left() > LEFT:
+            yield (
+                f"What is left is still {self.left():.1f} times the noise: more is missing than "
+                "the effects named here."
+            )
+
+    def nothing(self) -> Iterator[str]:
+        """What it means that nothing is missing."""
+        diagnosis = self.diagnosis
+        tried = counted(len({t.hypothesis.key for t in diagnosis.found}), "combination")
+        yield (
+            f"Of {tried} of effect and place none explains an error of more than "
+            f"{self.error(summary.smallest_material(diagnosis))} on motions left out of the fit. "
+            "An effect that these motions do not excite may still be missing."
+        )
+        if self.left() > LEFT:
+            yield (
+                "But what is left is too much for noise: its cause is none of the effects "
+                "in the library, or noise is larger than it seems at rest. The maps below show "
+                "where and when it happens."
+            )
+        else:
+            yield (
+                "With its parameters refitted, the simulator as it is will do for motions like "
+                "these."
+            )
+        if diagnosis.rounds and diagnosis.rounds[-1].finalists:
+            closest = diagnosis.rounds[-1]
+            named = self.speech.words(closest.chosen.effect, closest.chosen.place)
+            yield f"Closest was {named}; {summary.why_rejected(closest)}."
+        if diagnosis.noise.source == "assumed":
+            yield (
+                "No motion was recorded twice, so the noise level is assumed from how readings "
+                "flicker at rest. Repeat one motion three times to measure it."
+            )
+
+    def unclear(self) -> Iterator[str]:
+        """Why nothing can be said, and what would change that."""
+        yield f"{capital(self.diagnosis.reason)}."
+        if self.next:
+            return
+        yield (
+            "Record at least two types of motion, one of them twice: steps of 0.1, 0.3 and 0.6 rad "
+            "at irregular times, a slow triangle, a chirp from 0.2 to 5 Hz, and holds of three "
+            "seconds approached from both sides."
+        )
+
+    def facts(self) -> Iterator[tuple[str, str, str]]:
+        """Numbers to remember: name, value and a remark."""
+        diagnosis, units = self.diagnosis, self.speech.units
+        held = diagnosis.held_out
+        if held is not None:
+            after = f" → {1000 * held.after:.1f}" if diagnosis.findings else ""
+            yield (
+                "Error on motions left out",
+                f"{1000 * held.before:.1f}{after} {units.small}",
+                "nominal → corrected model" if after else "nominal model, refitted",
+            )
+        source = "measured from repeats" if diagnosis.noise.source == "repeats" else "assumed"
+        yield (
+            "Noise of a reading",
+            f"{1000 * summary.joint_noise(diagnosis):.1f} {units.small}",
+            source,
+        )
+        if np.isfinite(self.left()):
+            yield "What is left", f"{self.left():.2f}", "times the noise; 1: nothing but noise"
+        if diagnosis.findings:
+            least = min(f.probability for f in diagnosis.findings)
+            of = "" if len(diagnosis.findings) == 1 else "of the least sure finding"
+            yield "Probability", percent(least), of or "that effect and place are right"
+        if not diagnosis.nominal.certificate.holds:
+            yield "Nominal fit", "not converged", ""
+
+    def missing(self) -> Iterator[Html]:
+        """Each finding with its size, its law and what else it could be."""
+        for number, finding in enumerate(self.diagnosis.findings, start=1):
+            badge = tag(
+                "span",
+                str(number),
+                style=f"{BADGE} background: {MARKS[(number - 1) % len(MARKS)]}",
+            )
+            yield tag("h3", badge, self.speech.heading(finding.effect, finding.place))
+            if len(self.diagnosis.findings) > 1:
+                yield tag("p", self.sentences[number - 1])
+            yield tag("p", *self.detail(finding))
+            rows = self.sizes(finding)
+            if rows:
+                columns = [Column("Quantity"), Column("Value", "number")]
+                columns.append(Column("90 % interval", "number"))
+                yield table("Sizes as fitted", columns, rows)
+            yield tag("p", self.otherwise(finding))
+
+    def detail(self, finding: Finding) -> Iterator[str]:
+        """When a finding shows, and its law."""
+        if finding.regime == "throughout":
+            yield "It shows throughout the recordings. "
+        else:
+            yield f"It shows most {finding.regime}. "
+        if finding.law:
+            yield "In the simulator: "
+            yield tag("code", finding.law)
+            yield "."
+
+    def sizes(self, finding: Finding) -> list[tuple[str, str, str]]:
+        """Rows of a finding's quantities."""
+        rows = []
+        for name, p in finding.parameters.items():
+            value, low, high = (
+                self.speech.quantity(v, p.unit, 3) for v in (p.value, p.lower, p.upper)
+            )
+            rows.append((quantity_words(name), value, f"{low} to {high}"))
+        return rows
+
+    def otherwise(self, finding: Finding) -> str:
+        """What else a finding could be."""
+        rest = [
+            f"{self.speech.words(a.effect, a.place)} ({percent(a.probability)})"
+            for a in finding.equivalents
+        ]
+        own = f"Probability {percent(finding.probability)}."
+        if not rest:
+            return f"{own} No other effect of the library explains these motions nearly as well."
+        return f"{own} These motions would also fit {listed(rest)}."
+
+    def where(self) -> Iterator[Html]:
+        """The robot with the places in colour."""
+        diagnosis = self.diagnosis
+        recordings = diagnosis.measured.recordings
+        supports = {r.support for r in recordings}
+        joints = [c for c in summary.channels(diagnosis) if c < len(diagnosis.robot.joints)]
+        fit = diagnosis.nominal.fit
+        misfits = {
+            diagnosis.robot.joint_names[c]: summary.misfit(
+                diagnosis, fit, diagnosis.measured.channel == c
+            )
+            for c in joints
+        }
+        misfits = {n: v for n, v in misfits.items() if np.isfinite(v)}
+        if not misfits:
+            return
+        drawing = draw_robot(
+            diagnosis.robot,
+            min(supports - {"ground"} or supports),
+            [f.place for f in diagnosis.findings],
+            misfits,
+        )
+        worst = max(misfits, key=misfits.__getitem__)
+        marked = listed(
+            [f"{i} {self.speech.place(f.place)}" for i, f in enumerate(diagnosis.findings, start=1)]
+        )
+        cause = f"Rings and numbers, the causes: {marked}. " if marked else ""
+        yield figure(
+            drawing,
+            f"Outline of {diagnosis.robot.name}. {cause}",
+            f"{cause}Colours of the joints, the symptoms: the nominal fit is furthest off at the "
+            f"{self.speech.channels()[diagnosis.robot.joint_names.index(worst)]}, by "
+            f"{misfits[worst]:.1f} times the noise.",
+        )
+
+    def record_next(self) -> Iterator[Html]:
+        """The recording that would tell more."""
+        if not self.next:
+            return
+        yield tag("p", tag("strong", "Motion: "), str(self.next.get("motion", "")))
+        yield tag("p", capital(str(self.next.get("reason", ""))))
+        pairs = [tag("li", f"{_named(a)} from {_named(b)}") for a, b in self.next.get("splits", ())]
+        if pairs:
+            yield tag("p", "It would tell")
+            yield tag("ul", *pairs)
+        for finding in self.diagnosis.findings:
+            if finding.equivalents:
+                named = self.speech.words(finding.effect, finding.place)
+                yield tag("p", f"{capital(named)}: {self.otherwise(finding)}")
+
+    def came_about(self) -> Iterator[Html]:
+        """How the result came about."""
+        rows = flattened(self.provenance)
+        if rows:
+            yield table("How this came about", [Column("What"), Column("Value", "long")], rows)
+
+
+def _named(effect: Any) -> str:
+    return WORDS.get(str(effect), str(effect))
+
+
+def _fact(name: str, value: str, more: str) -> Html:
+    return tag("div", tag("dt", name), tag("dd", value, *([tag("small", more)] if more else [])))

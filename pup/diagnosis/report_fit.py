@@ -1,0 +1,131 @@
+"""The section of the report on the nominal fit: whether to trust it, its parameters, its data."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pup.diagnosis import summary
+from pup.diagnosis.engine import Diagnosis
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.nominal import SELF
+from pup.diagnosis.wording import Speech, change, digits, parameter_words
+from pup.physics.terms import split_column
+from pup.sysid.html import Column, Html, table, tag
+from pup.sysid.wording import counted, setup, thousandths
+
+BAND = 1.645
+"""Standard deviations of a 90 % interval."""
+
+
+def nominal(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
+    """Certificate, noise, parameters and recordings."""
+    yield tag("p", _certificate(diagnosis))
+    yield tag("p", _noise(diagnosis, speech))
+    yield tag(
+        "p",
+        f"{len(diagnosis.measured.values):,} readings were compared with "
+        f"{diagnosis.replays:,} simulations.",
+    )
+    yield _parameters(diagnosis, speech)
+    yield _recordings(diagnosis, speech)
+
+
+def _certificate(diagnosis: Diagnosis) -> str:
+    told = diagnosis.nominal.certificate
+    ends = ", ".join(f"{chi2:,.1f}" for chi2 in told.starts)
+    return (
+        "An optimiser that stops short looks like missing physics, so the fit is checked twice. "
+        f"From {counted(len(told.starts), 'start')} it ends at chi-squared {ends}: the best two "
+        f"{'agree' if told.agree else 'do not agree'}. Fitted to a simulation of itself it comes "
+        f"back to within {digits(told.recovered, 1)} standard deviations ({SELF:g} are allowed)."
+    )
+
+
+def _noise(diagnosis: Diagnosis, speech: Speech) -> str:
+    noise, joints = diagnosis.noise, len(diagnosis.robot.joints)
+    read = [c for c in summary.channels(diagnosis) if c < joints]
+    sigma = noise.sigma[read]
+    spread = thousandths(float(sigma.min()))
+    if len(read) > 1:
+        spread += f" to {thousandths(float(sigma.max()))}"
+    source = (
+        "measured from what differs between repeats of one motion"
+        if noise.source == "repeats"
+        else "assumed from how readings flicker at rest, as no motion was repeated"
+    )
+    text = f"Noise of the joints: {spread} {speech.units.small}, {source}"
+    tilts = [c for c in summary.channels(diagnosis) if c >= joints]
+    if tilts:
+        text += f"; of the torso's angles {thousandths(float(noise.sigma[tilts].max()))} mrad"
+    rho = float(noise.rho[read].mean()) if read else 0.0
+    return f"{text}. From tick to tick it is correlated by {rho:.2f}."
+
+
+def _parameters(diagnosis: Diagnosis, speech: Speech) -> Html:
+    """Nominal parameters in the robot's file, after the nominal fit, and corrected."""
+    robot = {p.name: p for p in diagnosis.robot.parameters}
+    before = _intervals(diagnosis.nominal.fit)
+    corrected = diagnosis.model.fit if diagnosis.model and diagnosis.findings else None
+    after = _intervals(corrected) if corrected else {}
+    columns = [Column("Parameter"), Column("Unit", "words"), Column("Robot's file", "number")]
+    columns.append(Column("Nominal fit", "number"))
+    if corrected:
+        columns += [Column("Corrected", "number"), Column("Nominal fit was off by", "number")]
+    rows = []
+    for name, (value, reach) in before.items():
+        known = robot.get(name)
+        row = [
+            parameter_words(name),
+            speech.unit(known.unit) if known else "",
+            digits(known.nominal, 4) if known else "",
+            _with(value, reach),
+        ]
+        if name in after:
+            row += [_with(*after[name]), change(value / after[name][0] - 1)]
+        rows.append(row)
+    return table("Nominal parameters, with half of their 90 % intervals", columns, rows)
+
+
+def _with(value: float, reach: float) -> str:
+    return f"{digits(value, 4)} ± {digits(reach, 2)}"
+
+
+def _intervals(fit: Fit) -> dict[str, tuple[float, float]]:
+    """Nominal parameters of a fit, each with half of its 90 % interval."""
+    deviation = np.sqrt(np.diag(fit.covariance()))
+    return {
+        c.name: (c.value(at), BAND * sigma * c.slope(at))
+        for c, at, sigma in zip(fit.coordinates, fit.at, deviation, strict=True)
+        if split_column(c.name) is None
+    }
+
+
+def _recordings(diagnosis: Diagnosis, speech: Speech) -> Html:
+    """What was recorded, and how well each is predicted when its type is left out."""
+    measured = diagnosis.measured
+    joints = measured.channel < len(diagnosis.robot.joints)
+    models = []
+    if diagnosis.model is not None:
+        models.append(
+            ("Nominal", diagnosis.rounds[0].before if diagnosis.rounds else diagnosis.model)
+        )
+    if diagnosis.findings and diagnosis.model is not None:
+        models.append(("Corrected", diagnosis.model))
+    columns = [Column("Recording", "long"), Column("Motion"), Column("Support")]
+    columns += [Column("Duration [s]", "number"), Column("Readings", "number")]
+    columns += [Column(f"{label} [{speech.units.small}]", "number") for label, _ in models]
+    knobs = any(r.setup for r in measured.recordings)
+    columns += [Column("Setup", "words")] if knobs else []
+    rows = []
+    for number, recording in enumerate(measured.recordings):
+        inside = joints & (measured.recording == number)
+        row = [recording.id, recording.motion, recording.support]
+        row += [f"{np.ptp(recording.time):.1f}", f"{int((measured.recording == number).sum())}"]
+        for _, model in models:
+            error = (measured.values - model.predicted)[inside]
+            row.append(thousandths(float(np.sqrt(np.mean(error**2)))) if inside.any() else "none")
+        rows.append([*row, setup(recording)] if knobs else row)
+    caption = "Recordings"
+    if models:
+        caption += ", with the joint errors of models that were fitted without their type of motion"
+    return table(caption, columns, rows)

@@ -1,0 +1,250 @@
+"""Refit what the score test shortlists, and keep what holds on motions it was not fitted to.
+
+Scores are linear and so are their rankings; a refit of each finalist together with all nominal
+parameters is not. Effects are added one by one, the best first, as long as they lower chi-squared
+by more than chance and predict types of motion that were left out; then each is tried without.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.evidence import Projector, Score, Trace, project_again, scores
+from pup.diagnosis.fitting import Coordinate, Fit, differentiate, fit_together, term_coordinate
+from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import LOST, Noise
+
+Array = NDArray[np.float64]
+
+FINALISTS = 10
+"""Hypotheses refitted in each round."""
+WORTH = 0.1
+"""A finalist promises at least this share of what the best one does."""
+MOST = 4
+"""Effects that are looked for."""
+KEPT = 0.25
+"""Share of its gain that an effect must keep on motions left out."""
+MATERIAL = 0.3
+"""An effect is material if it explains an error of this share of the noise, ..."""
+SIZABLE = 0.25
+"""... or is of at least this share of its typical size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The nominal model with some effects, fitted.
+
+    Attributes:
+      hypotheses: the effects, in the order in which they were found.
+      freedom: of their magnitudes and shapes, how many the data see.
+      fit: of nominal parameters and effects together.
+      held_out: chi-squared of each fold, predicted by a fit without it, shape (n_folds,).
+      predicted: what those fits predict, shape (n_samples,), rad.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    freedom: int
+    fit: Fit
+    held_out: Array
+    predicted: Array
+
+    @property
+    def worth(self) -> float:
+        """What it explains: half its chi-squared in sample, half out of it, and its complexity."""
+        samples = len(self.predicted)
+        inside = self.fit.chi2 + self.freedom * float(np.log(samples))
+        return (inside + float(self.held_out.sum())) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One effect's choice.
+
+    Attributes:
+      before: the model it was added to.
+      ranking: what the score test said, best first.
+      finalists: the models refitted, best first.
+      accepted: whether the first of them was added.
+    """
+
+    before: Model
+    ranking: tuple[Score, ...]
+    finalists: tuple[Model, ...]
+    accepted: bool
+
+    @property
+    def chosen(self) -> Hypothesis:
+        """The effect that was found best."""
+        return self.finalists[0].hypotheses[-1]
+
+
+class Selector:
+    """Adds effects to a nominal fit.
+
+    Args:
+      replays: simulates.
+      noise: weighs the samples.
+      found: traces of all hypotheses around the nominal fit.
+      enough: surprise that chance does not reach.
+    """
+
+    def __init__(
+        self, replays: Replays, noise: Noise, found: Sequence[Trace], enough: float
+    ) -> None:
+        self.replays = replays
+        self.noise = noise
+        self.found = tuple(found)
+        self.enough = enough
+        self.folds = _folds(replays)
+
+    def run(self, nominal: Fit) -> tuple[Model, list[Round]]:
+        """The model that is left when nothing more is worth adding, and how it came about."""
+        model = self.model((), nominal)
+        rounds: list[Round] = []
+        while len(model.hypotheses) < MOST:
+            chosen = self._round(model)
+            if chosen is None:
+                break
+            rounds.append(chosen)
+            if not chosen.accepted:
+                break
+            model = chosen.finalists[0]
+        return self._without(model), rounds
+
+    def model(self, hypotheses: Sequence[Hypothesis], fit: Fit) -> Model:
+        """A fitted model with its predictions of the folds."""
+        return self._held_out([(tuple(hypotheses), fit)])[0]
+
+    def without(self, model: Model, hypothesis: Hypothesis) -> Fit:
+        """The model refitted without one of its effects."""
+        fit = self._less(model, hypothesis)
+        fit_together([fit], self.replays, self.noise, iterations=8)
+        return fit
+
+    def _round(self, model: Model) -> Round | None:
+        fit = model.fit
+        assert fit.jacobian is not None and fit.residual is not None
+        rest = [t for t in self.found if t.hypothesis.key not in {h.key for h in model.hypotheses}]
+        project = Projector(fit.jacobian)
+        ranking = scores(project_again(rest, project), project(fit.residual[:, None])[:, 0])
+        if not ranking or ranking[0].surprise < self.enough:
+            return None
+        shortlist = _shortlist(ranking, self.enough)
+        tried = [self._started(model, score) for score in shortlist]
+        fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=8)
+        better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
+        if not better:
+            return Round(model, tuple(ranking), (), False)
+        finalists = sorted(self._held_out(better), key=lambda m: m.worth)
+        return Round(model, tuple(ranking), tuple(finalists), self._holds(model, finalists[0]))
+
+    def _holds(self, before: Model, after: Model) -> bool:
+        """Whether an effect keeps its gain where it was not fitted, and matters."""
+        inside = before.fit.chi2 - after.fit.chi2
+        outside = float((before.held_out - after.held_out).sum())
+        if outside <= max(KEPT * inside, 0.5 * self.enough):
+            return False
+        return _material(after.hypotheses[-1], before, after)
+
+    def _started(self, model: Model, score: Score) -> tuple[tuple[Hypothesis, ...], Fit]:
+        """A fit of a model with one effect more, where the score test says it lies."""
+        hypothesis = score.trace.hypothesis
+        sizes = np.clip(score.sizes, -3, 3) if hypothesis.signed else np.clip(score.sizes, 0.05, 3)
+        free = hypothesis.magnitudes + hypothesis.continuous
+        coordinates = tuple(term_coordinate(name, hypothesis.scale) for name in free)
+        shape = dict(hypothesis.shape)
+        start = [*sizes, *(c.coordinate(shape[c.name]) for c in coordinates[len(sizes) :])]
+        low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
+        fit = Fit(
+            model.fit.coordinates + coordinates,
+            np.r_[model.fit.at, np.clip(start, low, high)],
+            fixed={**model.fit.fixed, **{n: v for n, v in shape.items() if n not in free}},
+        )
+        return (*model.hypotheses, hypothesis), fit
+
+    def _without(self, model: Model) -> Model:
+        """The model less whatever it can do without."""
+        while len(model.hypotheses) > 1:
+            fits = [self._less(model, h) for h in model.hypotheses]
+            fit_together(fits, self.replays, self.noise, iterations=8)
+            costs = [fit.chi2 - model.fit.chi2 for fit in fits]
+            spare = int(np.argmin(costs))
+            if costs[spare] > self.enough:
+                return model
+            left = [h for i, h in enumerate(model.hypotheses) if i != spare]
+            model = self.model(left, fits[spare])
+        return model
+
+    def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
+        seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
+        return sum(seen[h.key] + len(h.continuous) for h in hypotheses)
+
+    def _less(self, model: Model, hypothesis: Hypothesis) -> Fit:
+        """A fit of the model without one of its effects."""
+        gone = {*hypothesis.magnitudes, *(name for name, _ in hypothesis.shape)}
+        kept = [i for i, c in enumerate(model.fit.coordinates) if c.name not in gone]
+        coordinates: tuple[Coordinate, ...] = tuple(model.fit.coordinates[i] for i in kept)
+        fixed = {n: v for n, v in model.fit.fixed.items() if n not in gone}
+        return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed)
+
+    def _held_out(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
+        """Models with the predictions of fits without each fold.
+
+        A fit without a fold starts where the whole fit ends, and takes one Gauss-Newton step.
+        """
+        differentiate([fit for _, fit in fitted if fit.jacobian is None], self.replays, self.noise)
+        measured = self.replays.measured
+        costs = np.zeros((len(fitted), len(self.folds)))
+        predicted = np.tile(measured.values, (len(fitted), 1))
+        for number, fold in enumerate(self.folds):
+            inside = measured.only(fold)
+            rows = [fit.row(_step_without(fit, inside)) for _, fit in fitted]
+            simulated = self.replays(rows, fold)
+            told = np.where(np.isnan(simulated), LOST, simulated)
+            predicted[:, inside] = told
+            errors = np.zeros((len(fitted), len(measured.values)))
+            errors[:, inside] = measured.values[inside] - told
+            costs[:, number] = (measured.whiten(errors, self.noise)[:, inside] ** 2).sum(axis=1)
+        return [
+            Model(hypotheses, self._freedom(hypotheses), fit, cost, values)
+            for (hypotheses, fit), cost, values in zip(fitted, costs, predicted, strict=True)
+        ]
+
+
+def _material(hypothesis: Hypothesis, before: Model, after: Model) -> bool:
+    """Whether an effect matters: by its size, or by the error it explains on motions left out."""
+    at = dict(zip(after.fit.names, after.fit.at, strict=True))
+    if any(abs(at[name]) >= SIZABLE for name in hypothesis.magnitudes):
+        return True
+    explained = float((before.held_out - after.held_out).sum()) / len(before.predicted)
+    return explained > MATERIAL**2
+
+
+def _step_without(fit: Fit, left_out: NDArray[np.bool_]) -> Array:
+    """Where a fit without some samples would end, by one Gauss-Newton step."""
+    assert fit.jacobian is not None and fit.residual is not None
+    jacobian = fit.jacobian[~left_out]
+    span = np.array([c.upper - c.lower for c in fit.coordinates])
+    normal = jacobian.T @ jacobian + np.diag(1e-2 / span**2)
+    step = np.linalg.solve(normal, jacobian.T @ fit.residual[~left_out])
+    low, high = (np.array([getattr(c, e) for c in fit.coordinates]) for e in ("lower", "upper"))
+    return np.asarray(np.clip(fit.at + np.clip(step, -0.3, 0.3), low, high))
+
+
+def _folds(replays: Replays) -> list[list[int]]:
+    """What is left out together: types of motion, or where there is one, recordings."""
+    types = list(replays.measured.motions().values())
+    return types if len(types) > 1 else [[i] for i in range(len(replays.measured.recordings))]
+
+
+def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
+    """The best score of each effect and place, as long as it promises enough."""
+    least = max(enough, WORTH * ranking[0].surprise)
+    best: dict[object, Score] = {}
+    for score in ranking:
+        if score.surprise >= least and len(best) < FINALISTS:
+            best.setdefault(score.trace.hypothesis.key, score)
+    return list(best.values())

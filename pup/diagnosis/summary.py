@@ -1,0 +1,320 @@
+"""Numbers that the report of a diagnosis draws: maps of errors, rankings, masking, what is hidden.
+
+Errors are those of whitened residuals: noise alone has a root mean square of 1.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.engine import Diagnosis
+from pup.diagnosis.evidence import Projector, Score, Trace, overlap, scores
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.regimes import Window, windows
+from pup.diagnosis.selection import KEPT, MATERIAL, Model, Round
+from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
+
+Array = NDArray[np.float64]
+
+FEWEST = 8
+"""Samples below which a cell of a map stays empty."""
+SAME = 0.99
+"""A finalist that explains this share of what the best one does predicts as well."""
+POWER = 1.28
+"""An effect this many standard deviations above the threshold is found nine times in ten."""
+LONGEST = 4.0
+"""A window is shown for at most as long, s."""
+BETTER = 0.1
+"""A window tells of a finding if the correction lowers its error by this share."""
+AROUND = 0.4
+"""Shown before and after a window, s."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One channel of one recording over a stretch of time.
+
+    Attributes:
+      window: what is told of.
+      channel: which one is shown.
+      start: of what is shown, s.
+      end: of it.
+    """
+
+    window: Window
+    channel: int
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A finalist of a round, as compared with the model before it.
+
+    Attributes:
+      score: what the score test said of it.
+      model: the model refitted.
+      inside: drop of chi-squared on what it was fitted to.
+      outside: drop on motions left out.
+      probability: of it among the finalists.
+    """
+
+    score: Score
+    model: Model
+    inside: float
+    outside: float
+    probability: float
+
+
+def channels(diagnosis: Diagnosis) -> list[int]:
+    """The channels that were read."""
+    return [int(c) for c in np.unique(diagnosis.measured.channel)]
+
+
+def misfit(diagnosis: Diagnosis, fit: Fit, chosen: NDArray[np.bool_]) -> float:
+    """Error of some samples in units of the noise; NaN where there are too few of them."""
+    assert fit.residual is not None
+    if chosen.sum() < FEWEST:
+        return float("nan")
+    return float(np.sqrt(np.mean(fit.residual[chosen] ** 2)))
+
+
+def by_regime(diagnosis: Diagnosis, fit: Fit) -> tuple[list[str], Array]:
+    """Names of regimes, and errors of shape (n_channels, n_regimes) in units of the noise."""
+    of = diagnosis.measured.channel
+    everything = np.ones(len(of), dtype=bool)
+    columns = [("overall", everything), *((r.name, r.inside) for r in diagnosis.regimes)]
+    rows = [
+        [
+            misfit(diagnosis, fit, (diagnosis.measured.channel == c) & inside)
+            for _, inside in columns
+        ]
+        for c in channels(diagnosis)
+    ]
+    return [name for name, _ in columns], np.array(rows)
+
+
+def by_time(diagnosis: Diagnosis, fit: Fit, recording: int, most: int) -> tuple[Array, Array]:
+    """Edges of bins, s, and errors of one recording, shape (n_channels, n_bins).
+
+    Args:
+      diagnosis: its samples.
+      fit: whose errors.
+      recording: its number.
+      most: bins, at most; fewer where readings are.
+    """
+    assert fit.residual is not None
+    measured = diagnosis.measured
+    inside = measured.recording == recording
+    readings = int(np.bincount(measured.channel[inside], minlength=1).max())
+    bins = int(np.clip(readings // 2, 1, most))
+    edges = np.linspace(0.0, float(measured.time[inside].max(initial=0.1)), bins + 1)
+    rows = []
+    for channel in channels(diagnosis):
+        chosen = inside & (measured.channel == channel)
+        at, squares = measured.time[chosen], fit.residual[chosen] ** 2
+        count = np.histogram(at, edges)[0]
+        total = np.histogram(at, edges, weights=squares)[0]
+        rows.append(np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan))
+    return edges, np.array(rows)
+
+
+def left_over(diagnosis: Diagnosis, model: Model) -> float:
+    """Error of a model on motions left out, in units of the noise."""
+    return float(np.sqrt(model.held_out.sum() / len(model.predicted)))
+
+
+def smallest_material(diagnosis: Diagnosis) -> float:
+    """An effect that explains a smaller error than this would not have been told of, rad."""
+    sigma = joint_noise(diagnosis)
+    return sigma * max(MATERIAL, float(np.sqrt(diagnosis.enough / len(diagnosis.measured.values))))
+
+
+def nominal_model(diagnosis: Diagnosis) -> Model:
+    """The model before anything was added."""
+    assert diagnosis.model is not None
+    return diagnosis.rounds[0].before if diagnosis.rounds else diagnosis.model
+
+
+def joint_noise(diagnosis: Diagnosis) -> float:
+    """Noise of the joints that were read, root mean square, rad."""
+    joints = [c for c in channels(diagnosis) if c < len(diagnosis.robot.joints)]
+    return float(np.sqrt(np.mean(diagnosis.noise.sigma[joints] ** 2))) if joints else float("nan")
+
+
+def first_ranking(diagnosis: Diagnosis) -> Sequence[Score]:
+    """What the score test says of the nominal fit's errors, best first."""
+    if diagnosis.rounds:
+        return diagnosis.rounds[0].ranking
+    fit = diagnosis.nominal.fit
+    if not diagnosis.found or fit.jacobian is None or fit.residual is None:
+        return ()
+    return scores(diagnosis.found, Projector(fit.jacobian)(fit.residual[:, None])[:, 0])
+
+
+def distinct(ranking: Sequence[Score], most: int) -> list[Score]:
+    """The best score of each effect and place."""
+    best: dict[object, Score] = {}
+    for score in ranking:
+        best.setdefault(score.trace.hypothesis.key, score)
+    return list(best.values())[:most]
+
+
+def rivals(chosen: Round) -> list[Rival]:
+    """The finalists of a round, best first."""
+    if not chosen.finalists:
+        return []
+    told = {score.trace.hypothesis: score for score in chosen.ranking}
+    chances, _ = probabilities(chosen.finalists)
+    return [
+        Rival(
+            told[model.hypotheses[-1]],
+            model,
+            chosen.before.fit.chi2 - model.fit.chi2,
+            float((chosen.before.held_out - model.held_out).sum()),
+            float(chance),
+        )
+        for model, chance in zip(chosen.finalists, chances, strict=True)
+    ]
+
+
+def why_behind(rival: Rival, best: Rival) -> str:
+    """Why a finalist fell behind the best."""
+    same = overlap(rival.score.trace, best.score.trace)
+    if rival.outside <= KEPT * rival.inside:
+        return "fits these motions but does not predict others"
+    if rival.probability >= WORTH_SAYING:
+        return f"hardly to be told apart: {100 * same:.0f} % the same trace"
+    if rival.outside >= SAME * best.outside:
+        return "predicts as well, but fits worse or needs more free numbers"
+    return f"explains {100 * (1 - rival.outside / best.outside):.0f} % less of motions left out"
+
+
+def why_rejected(chosen: Round) -> str:
+    """Why even the best finalist of a round was not added."""
+    told = rivals(chosen)
+    if not told:
+        return "refitted, none of them lowers the error by more than chance does"
+    if told[0].outside <= KEPT * told[0].inside:
+        return "its gain does not carry over to motions left out of the fit"
+    return "it is too small to matter"
+
+
+def imitation(trace: Trace, fit: Fit, sizes: Array) -> tuple[float, Array]:
+    """How nominal parameters imitate an effect of some size.
+
+    Args:
+      trace: the effect's.
+      fit: the nominal fit.
+      sizes: the effect's magnitudes, in typical sizes.
+
+    Returns:
+      The share of the effect that is hidden so, and the relative change of each parameter.
+    """
+    assert fit.jacobian is not None
+    whole, left = trace.whole @ sizes, trace.left @ sizes
+    moved = np.linalg.lstsq(fit.jacobian, whole, rcond=1e-6)[0]
+    hidden = 1 - float(np.linalg.norm(left)) / max(float(np.linalg.norm(whole)), 1e-300)
+    return hidden, np.expm1(np.clip(moved, -3.0, 3.0))
+
+
+def overlaps(ranking: Sequence[Score]) -> Array:
+    """How alike the traces are, shape (n, n), 0 to 1."""
+    return np.array([[overlap(a.trace, b.trace) for b in ranking] for a in ranking])
+
+
+def smallest_seen(trace: Trace, enough: float) -> float:
+    """The size of an effect that would be found nine times in ten, in typical sizes."""
+    lengths = np.linalg.norm(trace.left, axis=0)
+    return float((np.sqrt(enough) + POWER) / max(float(lengths.max()), 1e-12))
+
+
+def hardest(diagnosis: Diagnosis) -> list[tuple[Trace, float]]:
+    """Of each effect, the place where it could hide best, and up to which size; worst first."""
+    worst: dict[str, tuple[Trace, float]] = {}
+    best: dict[object, tuple[Trace, float]] = {}
+    for trace in diagnosis.found:
+        size = smallest_seen(trace, diagnosis.enough)
+        key = trace.hypothesis.key
+        if key not in best or size < best[key][1]:
+            best[key] = trace, size
+    for trace, size in best.values():
+        effect = trace.hypothesis.effect
+        if effect not in worst or size > worst[effect][1]:
+            worst[effect] = trace, size
+    return sorted(worst.values(), key=lambda pair: -pair[1])
+
+
+def telling(diagnosis: Diagnosis, finding: Finding, most: int) -> list[View]:
+    """The windows that show a finding best."""
+    assert diagnosis.model is not None
+    measured = diagnosis.measured
+    before, after = nominal_model(diagnosis).predicted, diagnosis.model.predicted
+    gain = (measured.values - before) ** 2 - (measured.values - after) ** 2
+    place = finding.place
+    if place.kind == "joint":
+        allowed = [diagnosis.robot.joint_names.index(place.name)]
+    else:
+        joints = diagnosis.robot.joints
+        members = [
+            i for i, j in enumerate(joints) if place.kind == "group" and j.group == place.name
+        ]
+        allowed = members or channels(diagnosis)
+    views = _views(diagnosis, finding.when, gain / _variance(diagnosis), allowed)
+    better: dict[object, View] = {}
+    for view in views:
+        if _drop(diagnosis, view) > BETTER:  # of repeats, one will do
+            better.setdefault((_first(diagnosis, view.window.recording), view.start), view)
+    return (list(better.values()) or views[:1])[:most]
+
+
+def _first(diagnosis: Diagnosis, name: str) -> str:
+    """The recording that another one repeats, or itself."""
+    return next(r.repeat_of or r.id for r in diagnosis.measured.recordings if r.id == name)
+
+
+def _drop(diagnosis: Diagnosis, view: View) -> float:
+    """By which share the corrected model's error in a view is smaller."""
+    assert diagnosis.model is not None
+    measured = diagnosis.measured
+    inside = (measured.time >= view.start) & (measured.time <= view.end)
+    inside &= measured.channel == view.channel
+    inside &= np.array([r.id == view.window.recording for r in measured.recordings])[
+        measured.recording
+    ]
+    before, after = (
+        float(np.linalg.norm((measured.values - m.predicted)[inside]))
+        for m in (nominal_model(diagnosis), diagnosis.model)
+    )
+    return 1 - after / max(before, 1e-300)
+
+
+def worst(diagnosis: Diagnosis, most: int) -> list[View]:
+    """The windows with the largest errors of the model."""
+    assert diagnosis.model is not None
+    errors = (diagnosis.measured.values - diagnosis.model.predicted) ** 2 / _variance(diagnosis)
+    found = windows(diagnosis.measured, errors, most)
+    return _views(diagnosis, found, errors, channels(diagnosis))
+
+
+def _variance(diagnosis: Diagnosis) -> Array:
+    return np.asarray(diagnosis.noise.sigma[diagnosis.measured.channel] ** 2)
+
+
+def _views(
+    diagnosis: Diagnosis, found: Sequence[Window], weight: Array, allowed: Sequence[int]
+) -> list[View]:
+    """Each window in the channel where most of a weight falls."""
+    measured = diagnosis.measured
+    names = [r.id for r in measured.recordings]
+    views = []
+    for window in found:
+        inside = measured.recording == names.index(window.recording)
+        inside &= (measured.time >= window.start) & (measured.time <= window.end)
+        sums = [float(weight[inside & (measured.channel == c)].sum()) for c in allowed]
+        start = max(window.start - AROUND, 0.0)
+        end = min(window.end, window.start + LONGEST) + AROUND
+        views.append(View(window, allowed[int(np.argmax(sums))], start, end))
+    return views

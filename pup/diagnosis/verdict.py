@@ -1,0 +1,235 @@
+"""From fitted models to what is said of them: findings, alternatives, probabilities."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.evidence import overlap
+from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.laws import EQUATIONS
+from pup.diagnosis.regimes import Regime, Window, strongest, windows
+from pup.diagnosis.residuals import Measured
+from pup.diagnosis.selection import Model, Round, Selector
+from pup.physics.terms import TERMS, Place, split_column
+
+Array = NDArray[np.float64]
+Answer = Literal["mismatch", "none", "undetermined"]
+
+TEMPERATURE = 4.0
+"""Differences of worth are divided by this: models of real data are never quite right."""
+UNKNOWN = 0.03
+"""Probability that a cause outside the library looks like the best inside."""
+WORTH_SAYING = 0.03
+"""Alternatives less probable than this are not told."""
+TWIN = 0.995
+"""Traces that overlap by so much cannot be told apart, refitted or not."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One fitted quantity of a finding, in its unit."""
+
+    value: float
+    unit: str
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another effect that would explain the same."""
+
+    effect: str
+    place: Place
+    probability: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One effect that the nominal model leaves out; fields as in CONTRACTS.md, section 5."""
+
+    effect: str
+    place: Place
+    regime: str
+    when: tuple[Window, ...]
+    parameters: Mapping[str, Parameter]
+    probability: float
+    equivalents: tuple[Alternative, ...]
+    absorbed_by: Mapping[str, float]
+    law: str | None
+    gain: float = 0.0
+    """Drop of chi-squared that it alone is worth."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors on motions that were left out of the fits, before and after.
+
+    Attributes:
+      recordings: their ids.
+      before: root mean square error of the nominal model, rad.
+      after: that of the corrected one, rad.
+      interval: 90 % interval of the relative improvement, over recordings.
+      per_joint: (before, after) by joint, rad.
+      per_motion: (before, after) by type of motion, rad.
+    """
+
+    recordings: tuple[str, ...]
+    before: float
+    after: float
+    interval: tuple[float, float]
+    per_joint: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    per_motion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def probabilities(models: Sequence[Model]) -> tuple[Array, float]:
+    """Of some rival models by their worth, and what is left for a cause unknown."""
+    worth = np.array([m.worth for m in models])
+    weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE))
+    return (1 - UNKNOWN) * weights / weights.sum(), UNKNOWN
+
+
+def findings(
+    final: Model,
+    rounds: Sequence[Round],
+    selector: Selector,
+    measured: Measured,
+    found: Sequence[Regime],
+) -> tuple[Finding, ...]:
+    """What the final model adds to the nominal one, most important first.
+
+    Args:
+      final: the model that selection has left.
+      rounds: how it came about.
+      selector: knows the traces and simulates.
+      measured: the samples.
+      found: the regimes of motion.
+    """
+    nominal = rounds[0].before
+    told = []
+    for hypothesis in final.hypotheses:
+        less = selector.without(final, hypothesis)
+        assert less.residual is not None and final.fit.residual is not None
+        gain = less.residual**2 - final.fit.residual**2
+        chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
+        probability, rivals = _rivals(hypothesis, chosen, selector)
+        told.append(
+            Finding(
+                effect=hypothesis.effect,
+                place=hypothesis.place,
+                regime=strongest(found, gain),
+                when=tuple(windows(measured, gain)),
+                parameters=_parameters(hypothesis, final),
+                probability=probability,
+                equivalents=rivals,
+                absorbed_by=_absorbed(nominal, final),
+                law=EQUATIONS[hypothesis.effect],
+                gain=less.chi2 - final.fit.chi2,
+            )
+        )
+    return tuple(sorted(told, key=lambda f: -f.gain))
+
+
+def held_out(measured: Measured, before: Model, after: Model, seed: int) -> HeldOut:
+    """Errors of the joints on motions left out, with an interval over recordings."""
+    joints = measured.channel < len(measured.robot.joints)
+    squares = [(measured.values - m.predicted) ** 2 for m in (before, after)]
+    numbers = np.unique(measured.recording[joints])
+    sums = np.array(
+        [[s[joints & (measured.recording == n)].sum() for n in numbers] for s in squares]
+    )
+    rng = np.random.default_rng(seed)
+    draws = rng.integers(len(numbers), size=(2000, len(numbers)))
+    drawn = sums[:, draws].sum(axis=2)
+    improvement = 1 - np.sqrt(drawn[1] / np.maximum(drawn[0], 1e-300))
+
+    def both(chosen: NDArray[np.bool_]) -> tuple[float, float]:
+        return tuple(float(np.sqrt(np.mean(s[chosen]))) for s in squares)  # type: ignore[return-value]
+
+    per_joint = {
+        name: both(measured.channel == i)
+        for i, name in enumerate(measured.robot.joint_names)
+        if (measured.channel == i).any()
+    }
+    per_motion = {
+        motion: both(joints & measured.only(members))
+        for motion, members in measured.motions().items()
+        if (joints & measured.only(members)).any()
+    }
+    low, high = np.quantile(improvement, (0.05, 0.95))
+    return HeldOut(
+        tuple(measured.recordings[n].id for n in numbers),
+        *both(joints),
+        (float(low), float(high)),
+        per_joint,
+        per_motion,
+    )
+
+
+def _rivals(
+    hypothesis: Hypothesis, chosen: Round, selector: Selector
+) -> tuple[float, tuple[Alternative, ...]]:
+    """The probability of a finding and of what else it might be."""
+    models = list(chosen.finalists)
+    chances, _ = probabilities(models)
+    by_key: dict[tuple[str, Place], float] = {}
+    for model, chance in zip(models, chances, strict=True):
+        key = model.hypotheses[-1].key
+        by_key[key] = by_key.get(key, 0.0) + float(chance)
+    own = by_key.pop(hypothesis.key)
+    twins = _twins(hypothesis, by_key, chosen, selector)
+    share = own / (1 + len(twins))
+    by_key |= dict.fromkeys(twins, share)
+    told = [Alternative(*key, p) for key, p in by_key.items() if p >= WORTH_SAYING]
+    return share, tuple(sorted(told, key=lambda a: -a.probability))
+
+
+def _twins(
+    hypothesis: Hypothesis,
+    known: Mapping[tuple[str, Place], float],
+    chosen: Round,
+    selector: Selector,
+) -> list[tuple[str, Place]]:
+    """Hypotheses that were not refitted but leave the same trace."""
+    traces = {s.trace.hypothesis: s.trace for s in chosen.ranking}
+    own = traces.get(hypothesis)
+    if own is None:
+        return []
+    refitted = {m.hypotheses[-1].key for m in chosen.finalists} | set(known) | {hypothesis.key}
+    return list(
+        dict.fromkeys(
+            other.key
+            for other, trace in traces.items()
+            if other.key not in refitted
+            and trace.basis.shape[1] == own.basis.shape[1] == 1
+            and overlap(trace, own) > TWIN
+        )
+    )
+
+
+def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
+    deviation = np.sqrt(np.diag(final.fit.covariance()))
+    told = {}
+    for i, coordinate in enumerate(final.fit.coordinates):
+        named = split_column(coordinate.name)
+        if named is None or (named[0], named[2]) != hypothesis.key:
+            continue
+        quantity = next(q for q in TERMS[named[0]].quantities if q.name == named[1])
+        at, reach = float(final.fit.at[i]), 1.645 * float(deviation[i])
+        ends = (max(at - reach, coordinate.lower), min(at + reach, coordinate.upper))
+        told[quantity.name] = Parameter(
+            coordinate.value(at), quantity.unit, *(coordinate.value(e) for e in ends)
+        )
+    return told
+
+
+def _absorbed(nominal: Model, final: Model) -> dict[str, float]:
+    """By how much nominal parameters were wrong to make up for what was missing."""
+    before, after = nominal.fit.values, final.fit.values
+    shifts = {n: before[n] / after[n] - 1 for n in before if "@" not in n and after.get(n)}
+    return {
+        n: float(s) for n, s in sorted(shifts.items(), key=lambda p: -abs(p[1])) if abs(s) > 0.01
+    }

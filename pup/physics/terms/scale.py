@@ -1,0 +1,54 @@
+"""How large typical sizes are on a robot of another strength than the one they were taken from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pup.robot import RobotDescription
+
+REFERENCE_TORQUE = 2.5
+"""Torque limit of the MX-28, N m, of whose kind the library's typical sizes are."""
+REFERENCE_RANGE = 2.0
+"""Range of a joint, rad, that they belong to."""
+
+_POWERS = {
+    # unit: powers of torque and of angle
+    "N m": (1, 0),
+    "rad": (0, 1),
+    "rad/s": (0, 1),
+    "N m/rad": (1, -1),
+    "N m s/rad": (1, -1),
+    "N m s2/rad2": (1, -2),
+    "N m/(rad s)": (1, -1),
+    "rad/(N m)": (-1, 1),
+    "1/(N m)": (-1, 0),
+    "s/rad": (0, -1),
+    "kg m2": (1, -1),
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Factors on the library's typical sizes.
+
+    Attributes:
+      torque: strength of the robot's servos over the reference.
+      angle: range of its joints over the reference; 1 for hinges.
+    """
+
+    torque: float
+    angle: float
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> "Scale":
+        """The scale of a robot: a slide's ranges are in m, forces in N."""
+        limits = [p.nominal for p in robot.parameters if p.name.startswith("tau_max/")]
+        torque = float(np.median(limits)) / REFERENCE_TORQUE if limits else 1.0
+        slides = any(p.unit == "N" for p in robot.parameters if p.name.startswith("tau_max/"))
+        ranges = [joint.upper - joint.lower for joint in robot.joints]
+        return cls(torque, float(np.median(ranges)) / REFERENCE_RANGE if slides else 1.0)
+
+    def factor(self, unit: str) -> float:
+        """On a quantity of some unit."""
+        torque, angle = _POWERS.get(unit, (0, 0))
+        return float(self.torque**torque * self.angle**angle)

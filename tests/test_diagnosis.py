@@ -1,0 +1,196 @@
+"""The diagnosis of a bench servo: what is concealed is named, what is not is not."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pup.diagnosis.engine import Diagnosis, diagnose
+from pup.diagnosis.evidence import Projector, scores, threshold, traces
+from pup.diagnosis.fitting import Coordinate, Fit, fit_together
+from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.replays import Batch, Bench, Replays, threads
+from pup.diagnosis.residuals import Measured, Noise, noise_floor, steady_start
+from pup.diagnosis.store import Store
+from pup.physics.parameters import robot_space
+from tests.diagnosis_cases import BENCH, recordings
+
+SERVO = "joint:servo"
+
+
+def found(missing: Mapping[str, float], seed: int = 3) -> Diagnosis:
+    return diagnose(
+        BENCH,
+        recordings(missing, seed),
+        lambda measured: threads(Bench(measured), 1),
+        1,
+        lambda stage, share: None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("missing", "effect", "quantity"),
+    [
+        ({f"coulomb_friction/torque@{SERVO}": 0.03}, "coulomb_friction", "torque"),
+        ({f"backlash/gap@{SERVO}": 0.008, f"backlash/behind@{SERVO}": 1.0}, "backlash", "gap"),
+        ({f"torque_speed_limit/slope@{SERVO}": 0.03}, "torque_speed_limit", "slope"),
+    ],
+)
+def test_a_concealed_effect_is_named_and_measured(
+    missing: Mapping[str, float], effect: str, quantity: str
+) -> None:
+    told = found(missing)
+    assert told.verdict == "mismatch"
+    first = told.findings[0]
+    assert first.effect == effect
+    assert first.place.name == "servo"
+    assert first.probability > 0.5
+    size = missing[f"{effect}/{quantity}@{SERVO}"]
+    assert first.parameters[quantity].value == pytest.approx(size, rel=0.15)
+    assert told.held_out is not None
+    assert told.held_out.after < told.held_out.before
+    assert told.held_out.after == pytest.approx(0.00205, rel=0.1)  # the noise, quantised
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_nothing_is_found_where_nothing_is_missing(seed: int) -> None:
+    told = found({}, seed)
+    assert told.verdict == "none"
+    assert not told.findings
+    assert told.nominal.certificate.holds
+
+
+def test_what_cannot_be_told_apart_is_told_together() -> None:
+    """Late commands and late readings are the same thing to a servo that starts at rest."""
+    told = found({f"command_delay/time@{SERVO}": 0.012})
+    named = {told.findings[0].effect, *(e.effect for e in told.findings[0].equivalents)}
+    assert {"command_delay", "measurement_delay"} <= named
+
+
+def test_poor_data_tell_nothing() -> None:
+    runs = recordings({f"coulomb_friction/torque@{SERVO}": 0.03})
+    still = tuple(replace(r, target=0 * r.target, position=0 * r.position) for r in runs)
+    for poor, why in ((runs[:1], "second motion"), (still, "no joint moves")):
+        told = diagnose(BENCH, poor, lambda m: threads(Bench(m), 1), 1, lambda stage, share: None)
+        assert told.verdict == "undetermined"
+        assert why in told.reason
+        assert not told.findings
+
+
+class TestNoise:
+    def test_repeats_tell_the_noise_of_each_reading(self) -> None:
+        measured = Measured.of(BENCH, recordings({}, noise=0.003))
+        rng = np.random.default_rng(0)
+        errors = 0.003 * rng.normal(size=len(measured.values))
+        noise = noise_floor(measured, errors)
+        assert noise.source == "repeats"
+        assert noise.sigma[0] == pytest.approx(0.003, rel=0.1)
+        assert noise.rho[0] < 0.2
+
+    def test_without_repeats_it_is_assumed_from_what_flickers(self) -> None:
+        runs = [replace(r, repeat_of=None) for r in recordings({}) if r.id != "step_1"]
+        measured = Measured.of(BENCH, runs)
+        rng = np.random.default_rng(0)
+        slow = 0.02 * np.sin(measured.time)
+        errors = slow + 0.003 * rng.normal(size=len(measured.values))
+        noise = noise_floor(measured, errors)
+        assert noise.source == "assumed"
+        assert noise.sigma[0] == pytest.approx(0.003, rel=0.3)
+
+    def test_whitening_undoes_correlation(self) -> None:
+        measured = Measured.of(BENCH, recordings({}))
+        rng = np.random.default_rng(1)
+        n = len(measured.values)
+        errors = np.zeros(n)
+        for i in range(n):
+            own = 0.002 * rng.normal()
+            first = i == 0 or measured.recording[i] != measured.recording[i - 1]
+            errors[i] = own if first else 0.6 * errors[i - 1] + 0.8 * own
+        noise = Noise(np.full(3, 0.002), np.full(3, 0.6), "assumed")
+        white = measured.whiten(errors, noise)
+        assert np.std(white) == pytest.approx(1, rel=0.1)
+        assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
+
+    def test_a_start_is_averaged_over_its_rest(self) -> None:
+        run = recordings({}, noise=0.003)[0]
+        steadied = steady_start(run)
+        rest = int(np.flatnonzero(run.target[:, 0] != run.target[0, 0])[0])
+        assert steadied.position[0, 0] == pytest.approx(run.position[:rest, 0].mean())
+        assert np.array_equal(steadied.position[1:], run.position[1:])
+
+
+class Linear:
+    """Replays of a model whose samples are linear in its parameters."""
+
+    def __init__(self, matrix: np.ndarray, data: np.ndarray) -> None:
+        self.matrix, self.asked = matrix, 0
+        self.measured = Measured.of(BENCH, recordings({}))
+        n = len(self.measured.values)
+        self.matrix = np.resize(matrix, (n, matrix.shape[1]))
+        self.measured = replace(self.measured, values=self.matrix @ data)
+
+    def __call__(self, rows: list[dict[str, float]]) -> np.ndarray:
+        self.asked += len(rows)
+        return np.array([self.matrix @ [row["a"], row["b"]] for row in rows])
+
+
+def test_fits_stay_in_their_boxes_and_find_the_corner() -> None:
+    rng = np.random.default_rng(5)
+    replays = Linear(rng.normal(size=(200, 2)), np.array([0.5, 3.0]))
+    free = (Coordinate("a", 1.0, 0.0, 1.0), Coordinate("b", 1.0, 0.0, 2.0))
+    noise = Noise(np.ones(3), np.zeros(3), "assumed")
+    fit = Fit(free, np.array([0.9, 0.1]))
+    fit_together([fit], replays, noise)  # type: ignore[arg-type]
+    assert fit.done
+    assert fit.at[1] == pytest.approx(2.0)
+    left = replays.measured.values - 2.0 * replays.matrix[:, 1]
+    best = float(left @ replays.matrix[:, 0] / (replays.matrix[:, 0] @ replays.matrix[:, 0]))
+    assert fit.at[0] == pytest.approx(np.clip(best, 0, 1), abs=1e-6)
+
+
+def test_the_threshold_is_reached_by_chance_as_often_as_it_says() -> None:
+    """Pure noise, projected as errors are, exceeds it in one case of twenty."""
+    measured = Measured.of(BENCH, recordings({}))
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    rng = np.random.default_rng(2)
+    noise = Noise(np.full(3, 0.002), np.zeros(3), "assumed")
+    free = tuple(
+        Coordinate(n, None, np.log(v) - 1, np.log(v) + 1)
+        for n, v in zip(replays.space.names, replays.space.nominal, strict=True)
+    )
+    fit = Fit(free, np.log(replays.space.nominal))
+    fit_together([fit], replays, noise, iterations=1)
+    told = traces(hypotheses(measured), fit, replays, noise)
+    enough = threshold(told, rng, 0.05)
+    assert fit.jacobian is not None
+    project = Projector(fit.jacobian)
+    exceeded = 0
+    for _ in range(300):
+        draw = project(rng.normal(size=(len(measured.values), 1)))[:, 0]
+        exceeded += scores(told, draw)[0].surprise > enough
+    assert 4 <= exceeded <= 32
+
+
+def test_what_was_replayed_is_not_replayed_again(tmp_path: Path) -> None:
+    measured = Measured.of(BENCH, recordings({}))
+    asked = []
+
+    def runner(batches: list[Batch]) -> list[np.ndarray]:
+        asked.append(len(batches))
+        return threads(Bench(measured), 1)(batches)
+
+    store = Store(tmp_path / "kept", "digest")
+    rows = [{"kp/servo": 3.0 + 0.1 * i} for i in range(4)]
+    first, second = (
+        Replays(measured, robot_space(BENCH, "pd"), store.around(runner), 1)(rows)  # type: ignore[arg-type]
+        for _ in range(2)
+    )
+    assert np.array_equal(first, second)
+    assert asked == [1, 0]
+    other = Store(tmp_path / "kept", "another").around(runner)  # type: ignore[arg-type]
+    Replays(measured, robot_space(BENCH, "pd"), other, 1)(rows)
+    assert asked[-1] == 1
+    store.clear()
+    assert not (tmp_path / "kept").exists()
