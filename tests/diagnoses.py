@@ -104,15 +104,17 @@ class Maker:
         fit = self.fit(hypothesis, error)
         return Model(known, len(known), fit, folds, self.measured.values - off)
 
-    def trace(self, hypothesis: Hypothesis, base: Fit) -> Trace:
+    def trace(self, hypothesis: Hypothesis, project: Projector) -> Trace:
         """Something that a hypothesis may have left in the samples."""
         whole = self.rng.normal(size=(self.samples, len(hypothesis.magnitudes)))
-        left = Projector(base.jacobian)(whole)  # type: ignore[arg-type]
+        left = project(whole)
         return Trace(hypothesis, whole, left, np.linalg.qr(left)[0])
 
     def nothing(self, error: float = 1.0) -> Diagnosis:
         """That nothing is missing; errors of the model in units of the noise."""
         model = self.model(None, error)
+        assert model.fit.jacobian is not None
+        project = Projector(model.fit.jacobian)
         tried = hypotheses(self.measured)
         chosen = tried[:: max(1, len(tried) // self.most)][: self.most]
         inside = self.measured.time > np.median(self.measured.time)
@@ -126,7 +128,7 @@ class Maker:
             held_out=held_out(self.measured, model, model, 0),
             model=model,
             rounds=(),
-            found=tuple(self.trace(h, model.fit) for h in chosen),
+            found=tuple(self.trace(h, project) for h in chosen),
             enough=ENOUGH,
             regimes=(Regime("at reversals", inside), Regime("at rest", ~inside)),
             replays=321,
@@ -144,7 +146,7 @@ class Maker:
         )
         hypothesis = Hypothesis(effect, place, self.scale, shape)
         rest = [t for t in base.found if t.hypothesis.key != hypothesis.key]
-        traces = (self.trace(hypothesis, before.fit), *rest)
+        traces = (self.trace(hypothesis, Projector(before.fit.jacobian)), *rest)
         strong = before.fit.residual + 30 * traces[0].left[:, 0] / np.linalg.norm(traces[0].left)
         after = self.model(hypothesis, 1.0)
         rival = self.model(rest[0].hypothesis, 2.0)

@@ -101,6 +101,7 @@ class Fit:
       thorough: whether it ends on a Jacobian of where it stands, not on an updated one.
       damping: of Levenberg and Marquardt.
       age: steps since the Jacobian was fresh.
+      width: of its finite differences, in their usual one.
       stuck: times in a row that no trial was better.
     """
 
@@ -117,6 +118,7 @@ class Fit:
     damping: float = 1e-2
     age: int = 0
     stuck: int = 0
+    width: float = 1.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -215,7 +217,7 @@ def _chi2(fit: Fit, residual: Array) -> float:
 def _step(fit: Fit, i: int) -> float:
     """A finite difference into the range."""
     coordinate = fit.coordinates[i]
-    step = STEP if coordinate.scale is None else 5 * STEP
+    step = fit.width * (STEP if coordinate.scale is None else 5 * STEP)
     return step if fit.at[i] + step <= coordinate.upper else -step
 
 

@@ -23,8 +23,8 @@ SPREAD = 0.35
 AGREEMENT = 1e-3
 """Two starts agree in chi-squared to this share of it, or to ABSOLUTE."""
 ABSOLUTE = 2.0
-REPEATS = 3
-"""How often starts that disagree are taken further."""
+WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
+"""Widths of finite differences with which starts that disagree are taken further."""
 SELF = 3.0
 """A refit of the fit's own simulation may be off by so many standard deviations."""
 FREE = ("kp", "kd", "tau_max", "armature", "ground_friction")
@@ -35,8 +35,8 @@ class Certificate:
     """Whether the nominal fit has converged.
 
     Attributes:
-      starts: chi-squared from each start.
-      agree: whether at least two of the best agree.
+      starts: chi-squared that the two best starts lead to.
+      agree: whether they agree.
       recovered: largest error of a refit of its own simulation, in standard deviations.
     """
 
@@ -86,45 +86,45 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     ground = any(r.support == "ground" for r in measured.recordings)
     space = replays.space
     coordinates = tuple(nominal_coordinate(space, n) for n in free_names(space, ground))
-    rough = _fit(coordinates, space, 0.0, rng, thorough=False)
-    fit_together([rough], replays, first, iterations=6)
-    assert rough.residual is not None
-    noise = noise_floor(measured, measured.values - replays([rough.row()])[0])
-    fits = [_fit(coordinates, space, SPREAD, rng) for _ in range(STARTS - 1)]
-    fits.append(Fit(coordinates, rough.at.copy()))
+    spreads = [0.0] + [SPREAD] * (STARTS - 1)
+    tried = [_start(coordinates, space, spread, rng) for spread in spreads]
+    fit_together(tried, replays, first)
+    tried.sort(key=lambda fit: fit.chi2)
+    noise = noise_floor(measured, measured.values - replays([tried[0].row()])[0])
+    fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
-    for _ in range(REPEATS):
-        best, second = sorted(fits, key=lambda fit: fit.chi2)[:2]
-        if _agree(best.chi2, second.chi2):
+    for width in WIDER:
+        if _agree(*fits):
             break
-        for fit in (best, second):  # kinks stop a fit short; a fresh start leads over them
-            fit.done, fit.jacobian, fit.damping = False, None, 1e-3
-        fit_together([best, second], replays, noise, iterations=6)
-    best = min(fits, key=lambda fit: fit.chi2)
+        for fit in fits:  # kinks stop a fit short; differences of another width lead over them
+            fit.done, fit.jacobian, fit.damping, fit.width = False, None, 1e-3, width
+        fit_together(fits, replays, noise, iterations=6)
+    agreed = _agree(*fits)
+    best, second = sorted(fits, key=lambda fit: fit.chi2)
     if best.jacobian is None:
         differentiate([best], replays, noise)
     own = _refit_of_itself(best, replays, noise, rng)
-    chi2 = tuple(sorted(fit.chi2 for fit in fits))
-    return Nominal(best, noise, Certificate(chi2, _agree(*chi2[:2]), own))
+    return Nominal(best, noise, Certificate((best.chi2, second.chi2), agreed, own))
 
 
-def _agree(best: float, second: float) -> bool:
-    return second - best <= max(AGREEMENT * best, ABSOLUTE)
+def _agree(first: Fit, second: Fit) -> bool:
+    apart = abs(first.chi2 - second.chi2)
+    return apart <= max(AGREEMENT * min(first.chi2, second.chi2), ABSOLUTE)
 
 
-def _fit(
+def _start(
     coordinates: Sequence[Coordinate],
     space: ParameterSpace,
     spread: float,
     rng: np.random.Generator,
-    thorough: bool = True,
 ) -> Fit:
+    """A rough fit from somewhere around the nominal values."""
     at = [
         c.coordinate(space.nominal[space.names.index(c.name)]) + spread * rng.normal()
         for c in coordinates
     ]
     low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
-    return Fit(tuple(coordinates), np.clip(at, low, high), thorough=thorough)
+    return Fit(tuple(coordinates), np.clip(at, low, high), thorough=False)
 
 
 def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator) -> float:

@@ -107,8 +107,8 @@ class Replays:
         self.space = space
         self.runner = runner
         self.lanes = lanes
-        self.count = 0
-        """Candidates replayed, one for each pass over all recordings."""
+        self.simulated = 0
+        """Recordings replayed, one for each candidate."""
 
     def __call__(
         self,
@@ -125,13 +125,30 @@ class Replays:
         """
         every = range(len(self.measured.recordings))
         chosen = tuple(every if recordings is None else recordings)
-        self.count += len(rows)
-        batches = self._batches(rows, chosen, push)
-        samples = int(self.measured.only(chosen).sum())
-        out = np.empty((len(rows), samples))
-        for batch, values in zip(batches, self.runner(batches), strict=True):
-            out[batch.rows] = values
+        return self._run([(self._batches(rows, chosen, push), len(rows))])[0]
+
+    def together(self, asked: Sequence[tuple[Sequence[Row], Sequence[int]]]) -> list[Array]:
+        """Several calls at once, each with its rows and recordings."""
+        return self._run(
+            [(self._batches(rows, tuple(chosen), None), len(rows)) for rows, chosen in asked]
+        )
+
+    def _run(self, calls: Sequence[tuple[list[Batch], int]]) -> list[Array]:
+        answers = iter(self.runner([batch for batches, _ in calls for batch in batches]))
+        out = []
+        for batches, rows in calls:
+            chosen = batches[0].recordings
+            samples = np.empty((rows, int(self.measured.only(chosen).sum())))
+            for batch in batches:
+                samples[batch.rows] = next(answers)
+            self.simulated += rows * len(chosen)
+            out.append(samples)
         return out
+
+    @property
+    def count(self) -> int:
+        """Candidates replayed, one for each pass over all recordings."""
+        return round(self.simulated / len(self.measured.recordings))
 
     def _batches(
         self, rows: Sequence[Row], recordings: tuple[int, ...], push: Push | None
@@ -139,9 +156,7 @@ class Replays:
         effects = [_effects(row) for row in rows]
         order = np.array(sorted(range(len(rows)), key=effects.__getitem__), dtype=np.int64)
         most = max(1, BATCH // len(recordings))
-        worth = max(
-            1, len(rows) * len(recordings) // WORTH
-        )  # small batches cost more than they save
+        worth = max(1, len(rows) * len(recordings) // WORTH)
         parts = max(min(self.lanes, worth), -(-len(rows) // most))
         return [
             Batch(

@@ -19,10 +19,14 @@ from pup.diagnosis.residuals import LOST, Noise
 
 Array = NDArray[np.float64]
 
-FINALISTS = 10
+FINALISTS = 8
 """Hypotheses refitted in each round."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
+ROUGH = 5
+"""Steps in which finalists are compared."""
+CLOSE, MARGIN = 4, 40.0
+"""So many of them are refitted to the end, if they are within so much chi-squared of the best."""
 MOST = 4
 """Effects that are looked for."""
 KEPT = 0.25
@@ -121,7 +125,7 @@ class Selector:
     def without(self, model: Model, hypothesis: Hypothesis) -> Fit:
         """The model refitted without one of its effects."""
         fit = self._less(model, hypothesis)
-        fit_together([fit], self.replays, self.noise, iterations=8)
+        fit_together([fit], self.replays, self.noise, iterations=ROUGH)
         return fit
 
     def _round(self, model: Model) -> Round | None:
@@ -134,12 +138,21 @@ class Selector:
             return None
         shortlist = _shortlist(ranking, self.enough)
         tried = [self._started(model, score) for score in shortlist]
-        fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=8)
+        self._refit([fit for _, fit in tried])
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
             return Round(model, tuple(ranking), (), False)
         finalists = sorted(self._held_out(better), key=lambda m: m.worth)
         return Round(model, tuple(ranking), tuple(finalists), self._holds(model, finalists[0]))
+
+    def _refit(self, fits: Sequence[Fit]) -> None:
+        """Refit finalists, all of them roughly and the best of them to the end."""
+        fit_together(fits, self.replays, self.noise, iterations=ROUGH)
+        best = sorted(fits, key=lambda fit: fit.chi2)[:CLOSE]
+        close = [fit for fit in best if fit.chi2 < 1.02 * best[0].chi2 + MARGIN]
+        for fit in close:
+            fit.thorough, fit.done, fit.jacobian = True, False, None
+        fit_together(close, self.replays, self.noise, iterations=6)
 
     def _holds(self, before: Model, after: Model) -> bool:
         """Whether an effect keeps its gain where it was not fitted, and matters."""
@@ -162,7 +175,12 @@ class Selector:
             model.fit.coordinates + coordinates,
             np.r_[model.fit.at, np.clip(start, low, high)],
             fixed={**model.fit.fixed, **{n: v for n, v in shape.items() if n not in free}},
+            thorough=False,
         )
+        if not hypothesis.continuous:  # the traces are the Jacobian's columns
+            assert model.fit.jacobian is not None
+            fit.jacobian = np.hstack([model.fit.jacobian, score.trace.whole])
+            fit.age = 1
         return (*model.hypotheses, hypothesis), fit
 
     def _without(self, model: Model) -> Model:
@@ -188,7 +206,7 @@ class Selector:
         kept = [i for i, c in enumerate(model.fit.coordinates) if c.name not in gone]
         coordinates: tuple[Coordinate, ...] = tuple(model.fit.coordinates[i] for i in kept)
         fixed = {n: v for n, v in model.fit.fixed.items() if n not in gone}
-        return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed)
+        return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed, thorough=False)
 
     def _held_out(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
         """Models with the predictions of fits without each fold.
@@ -199,10 +217,14 @@ class Selector:
         measured = self.replays.measured
         costs = np.zeros((len(fitted), len(self.folds)))
         predicted = np.tile(measured.values, (len(fitted), 1))
-        for number, fold in enumerate(self.folds):
-            inside = measured.only(fold)
-            rows = [fit.row(_step_without(fit, inside)) for _, fit in fitted]
-            simulated = self.replays(rows, fold)
+        insides = [measured.only(fold) for fold in self.folds]
+        asked = [
+            ([fit.row(_step_without(fit, inside)) for _, fit in fitted], fold)
+            for inside, fold in zip(insides, self.folds, strict=True)
+        ]
+        for number, (inside, simulated) in enumerate(
+            zip(insides, self.replays.together(asked), strict=True)
+        ):
             told = np.where(np.isnan(simulated), LOST, simulated)
             predicted[:, inside] = told
             errors = np.zeros((len(fitted), len(measured.values)))

@@ -111,7 +111,8 @@ def findings(
     nominal = rounds[0].before
     told = []
     for hypothesis in final.hypotheses:
-        less = selector.without(final, hypothesis)
+        alone = len(final.hypotheses) == 1
+        less = nominal.fit if alone else selector.without(final, hypothesis)
         assert less.residual is not None and final.fit.residual is not None
         gain = less.residual**2 - final.fit.residual**2
         chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
