@@ -112,7 +112,7 @@ def _finished(draft: Draft, rng: np.random.Generator, id: str) -> Case | None:
         each = _each(draft, reference) if len(draft.effects) > 1 else [alone]
         stratum = _label(draft.stratum, alone, draft.noise)
         faint = draft.stratum != "unidentifiable" and alone.snr < FAINT
-        missed = draft.stratum == "single" and stratum == "weak"
+        missed = draft.stratum in ("single", "masked") and stratum == "weak"
         if faint or missed or (len(each) > 1 and min(e.snr for e in each) < CLEAR):
             return None
         everything = alone

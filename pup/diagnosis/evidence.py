@@ -15,6 +15,7 @@ from scipy import stats
 
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import MODERATE, Hypothesis
+from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
 
@@ -109,15 +110,13 @@ def traces(
       noise: weighs the samples.
     """
     assert base.jacobian is not None
-    here = base.row()
-    rows = [{**here, **probe} for h in hypotheses for probe in h.probes()]
-    simulated = replays([here, *rows])
-    changes = replays.measured.whiten(simulated[1:] - simulated[0], noise)
+    probes = [probe for h in hypotheses for probe in h.probes()]
+    changed = replays.measured.whiten(changes([(base.row(), probes)], replays)[0], noise)
     project = Projector(base.jacobian)
     out, next_row = [], 0
     for hypothesis in hypotheses:
         count = len(hypothesis.magnitudes)
-        part = changes[next_row : next_row + count].T
+        part = changed[next_row : next_row + count].T
         next_row += count
         trace = _trace(hypothesis, part, project)
         if trace is not None:

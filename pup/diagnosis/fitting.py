@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.physics.parameters import ParameterSpace
@@ -172,24 +173,17 @@ def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations
 
 def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Give some fits fresh Jacobians where they stand."""
-    moved = [(fit, i) for fit in fits for i in range(len(fit.coordinates))]
-    if not moved:
+    if not fits:
         return
-    steps = [_step(fit, i) for fit, i in moved]
-    points = []
-    for (fit, i), step in zip(moved, steps, strict=True):
-        at = fit.at.copy()
-        at[i] += step
-        points.append(fit.row(at))
-    values = _residuals([fit for fit, _ in moved], replays(points), replays, noise)
-    for fit in fits:
-        assert fit.residual is not None
-        columns = [
-            (fit.residual - value) / step
-            for (owner, _), step, value in zip(moved, steps, values, strict=True)
-            if owner is fit
-        ]
-        fit.jacobian = np.stack(columns, axis=1)
+    steps = [[_step(fit, i) for i in range(len(fit.coordinates))] for fit in fits]
+    asked = []
+    for fit, widths in zip(fits, steps, strict=True):
+        moved = zip(fit.coordinates, fit.at + widths, strict=True)
+        asked.append((fit.row(), [{c.name: c.value(x)} for c, x in moved]))
+    for fit, widths, changed in zip(fits, steps, changes(asked, replays), strict=True):
+        lost = np.isnan(changed).any(axis=1, keepdims=True)
+        white = replays.measured.whiten(np.where(lost, 0.0, changed), noise)
+        fit.jacobian = (white / np.array(widths)[:, None]).T
         fit.age = 0
 
 

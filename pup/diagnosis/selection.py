@@ -27,7 +27,7 @@ ROUGH = 5
 """Steps in which finalists are compared."""
 CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
-MOST = 4
+MOST = 8
 """Effects that are looked for."""
 KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""

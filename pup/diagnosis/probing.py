@@ -1,0 +1,143 @@
+"""Many small changes simulated at once, where they cannot meet.
+
+On a fixed torso limbs move apart from each other: a change at one limb leaves all others alone, but
+for rounding. Changes at different limbs then share a simulation, and each is read from its own
+limb's joints. On the ground everything moves everything, and each change has its own.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.replays import Replays, Row
+from pup.physics.model import compile_model
+from pup.physics.terms import split_column
+from pup.recording import Recording
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+
+
+def changes(asked: Sequence[tuple[Row, Sequence[Row]]], replays: Replays) -> list[Array]:
+    """What probes change in the samples.
+
+    Args:
+      asked: where some probes start, and the columns that each of them sets.
+      replays: simulates.
+
+    Returns:
+      For each of them the changes, shape (n_probes, n_samples), rad.
+    """
+    measured = replays.measured
+    every = range(len(measured.recordings))
+    ground = [i for i in every if measured.recordings[i].support == "ground"]
+    fixed = [i for i in every if i not in ground]
+    limbs = limbs_of(measured.robot, measured.recordings)
+    packs = [_packs(probes, measured.robot, limbs) if fixed else [] for _, probes in asked]
+    calls: list[tuple[list[Row], list[int]]] = []
+    if fixed:
+        rows = [
+            row
+            for (here, probes), packed in zip(asked, packs, strict=True)
+            for row in (here, *(_merged(here, probes, pack) for pack in packed))
+        ]
+        calls.append((rows, fixed))
+    if ground:
+        calls.append(
+            ([r for here, p in asked for r in (here, *({**here, **q} for q in p))], ground)
+        )
+    answers = iter(replays.together(calls))
+    out = [np.zeros((len(probes), len(measured.values))) for _, probes in asked]
+    if fixed:
+        told = next(answers)
+        inside = measured.only(fixed)
+        limb = limbs[measured.channel[inside]]
+        for (_, probes), packed, changed in zip(asked, packs, out, strict=True):
+            base, told = told[0], told[1:]
+            for pack in packed:
+                change, told = told[0] - base, told[1:]
+                for i in pack:
+                    mine = np.isin(limb, list(_reach(probes[i], measured.robot, limbs)))
+                    changed[i, inside] = np.where(mine, change, 0.0)
+    if ground:
+        told = next(answers)
+        for (_, probes), changed in zip(asked, out, strict=True):
+            changed[:, measured.only(ground)] = told[1 : 1 + len(probes)] - told[0]
+            told = told[1 + len(probes) :]
+    return out
+
+
+def _merged(here: Row, probes: Sequence[Row], pack: Sequence[int]) -> Row:
+    return {**here, **{name: value for i in pack for name, value in probes[i].items()}}
+
+
+def limbs_of(robot: RobotDescription, recordings: Sequence[Recording]) -> NDArray[np.int64]:
+    """Number of the limb that each joint belongs to while the torso is fixed, (n_joints,)."""
+    support = next((r.support for r in recordings if r.support != "ground"), "ground")
+    model = compile_model(robot, support).compiled
+    bodies = [int(model.joint(name).bodyid[0]) for name in robot.joint_names]
+    roots = []
+    for body in bodies:
+        root, above = body, int(model.body_parentid[body])
+        while above:
+            if above in bodies:
+                root = above
+            above = int(model.body_parentid[above])
+        roots.append(root)
+    return np.asarray(np.unique(roots, return_inverse=True)[1], dtype=np.int64)
+
+
+def _packs(
+    probes: Sequence[Row], robot: RobotDescription, limbs: NDArray[np.int64]
+) -> list[list[int]]:
+    """Probes that share a simulation: none reaches a limb of another, and no two are alike."""
+    packs: list[tuple[set[int], list[int]]] = []
+    for i, probe in enumerate(probes):
+        reach = _reach(probe, robot, limbs)
+        for taken, members in packs[::-1]:
+            if not taken & reach:
+                taken |= reach
+                members.append(i)
+                break
+        else:
+            packs.append((set(reach), [i]))
+    return [members for _, members in packs]
+
+
+def _reach(probe: Row, robot: RobotDescription, limbs: NDArray[np.int64]) -> frozenset[int]:
+    """The limbs that a probe's columns act on."""
+    return frozenset(int(limb) for name in probe for limb in _limbs_reached(name, robot, limbs))
+
+
+def _limbs_reached(
+    name: str, robot: RobotDescription, limbs: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    told = split_column(name)
+    if told is not None:
+        kind, place = told[2].kind, told[2].name
+    else:
+        group = name.partition("/")[2]
+        kind, place = ("group", group) if group in robot.groups else ("robot", "")
+    if kind == "joint":
+        return np.asarray(limbs[[robot.joint_names.index(place)]])
+    if kind == "group":
+        return np.asarray(limbs[robot.group_index == robot.groups.index(place)])
+    if kind == "body":
+        return np.asarray(limbs[_carrier(robot, place)])
+    return limbs
+
+
+def _carrier(robot: RobotDescription, body: str) -> NDArray[np.bool_]:
+    """The joint that moves a body; all joints where none does."""
+    support = "suspended" if robot.floating else "bench"
+    model = compile_model(robot, support).compiled
+    carriers = {int(model.joint(n).bodyid[0]): i for i, n in enumerate(robot.joint_names)}
+    at = int(model.body(body).id)
+    chosen = np.zeros(len(robot.joints), dtype=bool)
+    while at:
+        if at in carriers:
+            chosen[carriers[at]] = True
+            return chosen
+        at = int(model.body_parentid[at])
+    return ~chosen
