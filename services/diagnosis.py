@@ -1,13 +1,16 @@
 """The diagnosis job: recordings in, `diagnosis.json`, `report.html` and `corrected/` out."""
 
 import hashlib
+import platform
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis, diagnose
 from pup.diagnosis.replays import Runner
+from pup.diagnosis.report import write_report
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.store import Store
 from pup.files import write_json
@@ -34,7 +37,7 @@ def run_diagnosis(
     Args:
       robot: the robot.
       recordings: of that robot.
-      out: folder for `diagnosis.json` and `corrected/`.
+      out: folder for `diagnosis.json`, `report.html` and `corrected/`.
       runner: makes what runs batches of replays.
       lanes: how many run at once.
       progress: told the stage and the share of all that is done.
@@ -48,6 +51,8 @@ def run_diagnosis(
     corrected = _write_corrected(found, out)
     told = document(found, corrected)
     write_json(out / "diagnosis.json", told)
+    progress("report", 0.98)
+    write_report(found, out / "report.html", _provenance(robot, recordings, told, seed))
     store.clear()
     progress("done", 1.0)
     return told
@@ -70,6 +75,20 @@ def _write_corrected(found: Diagnosis, out: Path) -> str:
     folder = out / "corrected"
     write_corrected(found.robot, folder, values, known, "Corrected by `pup diagnose`.")
     return str(folder)
+
+
+def _provenance(
+    robot: RobotDescription, recordings: Sequence[Recording], told: dict[str, Any], seed: int
+) -> dict[str, Any]:
+    """What the diagnosis was made from, and what to record next."""
+    packages = ("pup", "mujoco", "numpy")
+    return {
+        "robot_digest": robot.digest,
+        "recordings": {r.id: r.digest for r in recordings},
+        "seed": seed,
+        "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
+        "next_recording": told["next_recording"],
+    }
 
 
 def _digest(robot: RobotDescription, recordings: Sequence[Recording]) -> str:

@@ -13,6 +13,7 @@ from pup.blind.world import Array, Engine, Indices, Nominal, Plan, World, nomina
 NUDGE = 0.04  # relative change of a parameter for its sensitivity
 COARSE = 10  # joints from which sensitivities take a coarser step
 FURTHEST = (-0.8, 3.0)  # relative changes of parameters in a refit
+STRIDE = 0.5  # largest relative change of a parameter in one step
 LOUD = 2.0  # sigma, from which a reading counts as off
 MATERIAL = 0.3  # of sigma, the held-out gain from which an omission matters
 
@@ -257,8 +258,9 @@ class Reference:
 
 
 def _solved(slopes: Array, rest: Array) -> Array:
-    """The linear step that explains most."""
-    return np.asarray(np.linalg.lstsq(slopes, rest, rcond=1e-6)[0], dtype=np.float64)
+    """The linear step that explains most, no longer than what linear theory is good for."""
+    step = np.asarray(np.linalg.lstsq(slopes, rest, rcond=1e-6)[0], dtype=np.float64)
+    return step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-12))
 
 
 def _weights(seen: Seen, noise: Noise) -> tuple[Array, Indices]:

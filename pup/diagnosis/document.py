@@ -34,7 +34,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
         },
         "findings": [_finding(f, robot) for f in diagnosis.findings],
         "held_out": _held_out(diagnosis.held_out),
-        "next_recording": None,
+        "next_recording": diagnosis.ask.document() if diagnosis.ask else None,
         "corrected_robot": corrected,
         "certificate": {"chi2": list(certificate.starts), "recovered": certificate.recovered},
         "nominal": {n: float(v) for n, v in diagnosis.nominal.fit.values.items()},

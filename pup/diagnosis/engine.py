@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Trace, threshold, traces
+from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import differentiate
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.nominal import Nominal, fit_nominal
@@ -50,6 +51,7 @@ class Diagnosis:
       enough: surprise that chance does not reach.
       regimes: the regimes of motion.
       replays: candidates simulated.
+      ask: what to record next; None where nothing is open, or nothing would settle it.
     """
 
     robot: RobotDescription
@@ -65,6 +67,7 @@ class Diagnosis:
     enough: float
     regimes: tuple[Regime, ...]
     replays: int
+    ask: NextRecording | None = None
 
     @property
     def noise(self) -> Noise:
@@ -138,7 +141,25 @@ def diagnose(
     progress("findings", 0.9)
     differentiate([model.fit], replays, nominal.noise)
     named = findings(model, rounds, selector, measured, seen)
-    return told("mismatch", findings=named, held_out=errors, model=model, **evidence)
+    progress("next recording", 0.95)
+    ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
+    return told("mismatch", findings=named, held_out=errors, model=model, ask=ask, **evidence)
+
+
+def _next(
+    found: Sequence[Finding],
+    rounds: Sequence[Round],
+    selector: Selector,
+    factory: Callable[[Measured], Replays],
+) -> NextRecording | None:
+    """What to record next: what would settle the most important finding that is not settled."""
+    for finding in found:
+        if finding.equivalents:
+            key = finding.effect, finding.place
+            chosen = next(r for r in rounds if r.accepted and r.chosen.key == key)
+            rivals = rivals_of(finding, chosen, selector)
+            return next_recording(selector.replays.measured.robot, rivals, selector.noise, factory)
+    return None
 
 
 def _regimes(nominal: Nominal, replays: Replays) -> list[Regime]:

@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 
 SPLITS = 10.0
 """Expected difference of chi-squared that tells two rivals apart."""
-AMPLE = 60.0
-"""More than this is of no more use."""
+AMPLE = 30.0
+"""A difference of so much is of half the use of any larger one."""
 EFFORT = 0.9
 """An option that asks for a change beside the motion is worth this share of one that does not."""
 MOST = 5
@@ -168,7 +168,7 @@ def next_recording(
         for number, option in enumerate(offered):
             pairs = _pairs(rivals, answers, measured.recording == number)
             worth = sum(
-                a.probability * b.probability * min(pair.expected, AMPLE)
+                a.probability * b.probability * pair.expected / (pair.expected + AMPLE)
                 for (a, b), pair in zip(combinations(rivals, 2), pairs, strict=True)
             )
             worth *= 1.0 if option.plain else EFFORT

@@ -33,6 +33,8 @@ MAP = matplotlib.colormaps["YlOrBr"]
 SHARES = matplotlib.colormaps["Blues"]
 CHANGES = matplotlib.colormaps["PuOr_r"]
 MISFIT = "error in units of the noise (1: noise alone)"
+CROWD = 12
+"""Rows beyond which they stand closer."""
 SHARP = 200
 """Resolution of pictures inside figures, dots per inch."""
 
@@ -70,7 +72,8 @@ def error_bars(
     """
     shown = ("nominal model", "corrected model")[: len(pairs[0])]
     thick = 0.8 / len(shown)
-    figure = new_figure(WIDTH, 0.95 + (0.14 + 0.13 * len(shown)) * len(names))
+    crowd = 0.75 if len(names) > CROWD else 1.0
+    figure = new_figure(WIDTH, 0.95 + crowd * (0.14 + 0.13 * len(shown)) * len(names))
     axes = figure.subplots()
     for i, (label, colour) in enumerate(zip(shown, (BEFORE, AFTER), strict=False)):
         at = np.arange(len(names)) - 0.4 + (i + 0.5) * thick

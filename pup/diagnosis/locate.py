@@ -48,6 +48,7 @@ class MissingInput:
       mean: most probable torques of each recording, (n_knots, n_channels); 0 for channels that
         lack nothing.
       deviation: their standard deviation, same shape; BAND of them is half of a 90 % band.
+      explained: what they add to the samples, whitened, shape (n_samples,).
     """
 
     channels: tuple[str, ...]
@@ -58,6 +59,7 @@ class MissingInput:
     time: tuple[Array, ...]
     mean: tuple[Array, ...]
     deviation: tuple[Array, ...]
+    explained: Array
 
     def ranking(self) -> list[tuple[str, float]]:
         """Channels and their evidence, strongest first."""
@@ -93,6 +95,7 @@ def explained_by(answers: Responses, fit: Fit) -> MissingInput:
         tuple(answers.knots(i) for i in recordings),
         tuple(m * answers.size for m in mean),
         tuple(d * answers.size for d in deviation),
+        problem.explained(),
     )
 
 
@@ -269,7 +272,6 @@ class _Problem:
         shift, spread = self._shift(told)
         power = np.zeros(len(self.strength))
         seen = np.zeros(len(self.strength))
-        left = self.residual - self.jacobian @ shift
         for limb, part in zip(self.limbs, told, strict=True):
             mean, moved = self._mean(limb, part, shift)
             traced = limb.prior.trace(part.factor.inverse(), limb.width)
@@ -277,8 +279,7 @@ class _Problem:
             count = len(limb.parts) * limb.prior.knots
             seen[limb.channels] += count - traced / self.strength[limb.channels] ** 2
             power[limb.channels] += np.einsum("nkci,nkci->c", limb.prior.times(mean), mean)
-            for i, (one, matrix) in enumerate(zip(limb.parts, limb.matrices, strict=True)):
-                left[one.samples] -= matrix @ mean[i].ravel()[: matrix.shape[1]]
+        left = self.residual - self.jacobian @ shift - self._told_by(told, shift)
         acting = self.acting
         now = self.strength[acting] ** 2
         asked = power[acting] / np.maximum(seen[acting], 1e-3)
@@ -296,7 +297,8 @@ class _Problem:
         """Means and standard deviations by recording, each (n_knots, n_channels)."""
         told = [limb.told(self.strength, self.variance) for limb in self.limbs]
         shift, spread = self._shift(told)
-        means, deviations = ([np.zeros_like(blank) for blank in self.blank] for _ in range(2))
+        means = [blank.copy() for blank in self.blank]
+        deviations = [blank.copy() for blank in self.blank]
         for limb, part in zip(self.limbs, told, strict=True):
             mean, moved = self._mean(limb, part, shift)
             own = np.diagonal(part.factor.inverse().diagonal, axis1=2, axis2=3)
@@ -304,8 +306,22 @@ class _Problem:
             variance = variance + np.einsum("nkci,ij,nkcj->nkc", moved, spread, moved)
             for i, one in enumerate(limb.parts):
                 means[one.recording][:, limb.channels] = mean[i, : one.knots, :, 0]
-                deviations[one.recording][:, limb.channels] = np.sqrt(variance[i, : one.knots])
+                spread_of = np.sqrt(variance[i, : one.knots])
+                deviations[one.recording][:, limb.channels] = spread_of
         return means, deviations
+
+    def explained(self) -> Array:
+        """What the mean torques add to the samples, whitened, (n_samples,)."""
+        told = [limb.told(self.strength, self.variance) for limb in self.limbs]
+        return self._told_by(told, self._shift(told)[0])
+
+    def _told_by(self, told: Sequence[_Told], shift: Array) -> Array:
+        out = np.zeros_like(self.residual)
+        for limb, part in zip(self.limbs, told, strict=True):
+            mean, _ = self._mean(limb, part, shift)
+            for i, (one, matrix) in enumerate(zip(limb.parts, limb.matrices, strict=True)):
+                out[one.samples] += matrix @ mean[i].ravel()[: matrix.shape[1]]
+        return out
 
     def ratios(self) -> Array:
         """Logarithm of how much more probable the data are with each channel, (n_channels,)."""
@@ -330,12 +346,12 @@ class _Problem:
     def _shift(self, told: Sequence[_Told]) -> tuple[Array, Array]:
         """How far the model's own parameters move, and the covariance of that."""
         precision, right, _ = self._system(told)
-        spread = np.linalg.inv(precision)
-        return spread @ right, spread
+        spread = np.asarray(np.linalg.inv(precision))
+        return np.asarray(spread @ right), spread
 
     def _mean(self, limb: _Limb, told: _Told, shift: Array) -> tuple[Array, Array]:
         """Mean torques, (n, n_knots, n_channels, 1), and by how much each shift moves them."""
-        mean = np.asarray(told.solved[..., :1] - told.solved[..., 1:] @ shift[:, None])
+        mean: Array = told.solved[..., :1] - told.solved[..., 1:] @ shift[:, None]
         return limb.shaped(mean), limb.shaped(told.solved[..., 1:])
 
     def _evidence(self, told: Sequence[_Told]) -> float:

@@ -98,7 +98,9 @@ def digits(value: float, count: int = 2) -> str:
 def percent(share: float) -> str:
     """A share, to whole per cents where it has two digits of them."""
     value = 100 * share
-    return f"{value:.0f} %" if abs(value) >= 9.5 else f"{digits(value, 2 if value else 1)} %"
+    if abs(value) < 0.05:
+        return "0 %"
+    return f"{value:.0f} %" if abs(value) >= 9.5 else f"{digits(value)} %"
 
 
 def minus(text: str) -> str:

@@ -41,6 +41,7 @@ from pup.physics.terms.friction import (
     PreslidingHysteresis,
     StribeckFriction,
 )
+from pup.physics.terms.learned import LearnedLaw
 from pup.physics.terms.sensing import (
     EncoderBias,
     EncoderEccentricity,
@@ -104,6 +105,8 @@ TERMS: dict[str, type[Term]] = {
         GroundSlope,
     )
 }
+BEYOND: dict[str, type[Term]] = {LearnedLaw.effect: LearnedLaw}
+"""Terms that are no effect of the library; they act after all others."""
 CLASSES: dict[str, tuple[str, ...]] = {
     "dry_friction": ("coulomb_friction", "stribeck_friction", "presliding_hysteresis"),
     "load_friction": ("load_dependent_friction", "gear_efficiency"),
@@ -175,9 +178,10 @@ def split_column(name: str) -> tuple[str, str, Place] | None:
 
 
 def _term(effect: str) -> type[Term]:
-    if effect not in TERMS:
-        raise InputError(f"there is no effect {effect!r}; known: {', '.join(TERMS)}")
-    return TERMS[effect]
+    known = TERMS | BEYOND
+    if effect not in known:
+        raise InputError(f"there is no effect {effect!r}; known: {', '.join(known)}")
+    return known[effect]
 
 
 def _quantity(term: type[Term], name: str) -> Quantity:
@@ -190,7 +194,7 @@ def _quantity(term: type[Term], name: str) -> Quantity:
 
 def term_space(effect: str, place: Place) -> ParameterSpace:
     """The parameters of one effect at one place, nominally absent."""
-    quantities = TERMS[effect].quantities
+    quantities = _term(effect).quantities
     return ParameterSpace(
         tuple(column(effect, q.name, place) for q in quantities),
         tuple(q.unit for q in quantities),
@@ -237,7 +241,7 @@ def bind_terms(candidates: Candidates, scene: Scene) -> list[Term]:
         if told is not None and (scene.model.floating or told[2].kind not in ("ground", "foot")):
             named.setdefault(told[0], []).append((name, told[1], told[2]))
     bound: list[Term] = []
-    for effect, term in TERMS.items():
+    for effect, term in (TERMS | BEYOND).items():
         columns = named.get(effect, [])
         sizes = {q.name for q in term.magnitudes()}
         if any(candidates[name].any() for name, quantity, _ in columns if quantity in sizes):

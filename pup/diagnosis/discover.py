@@ -1,0 +1,272 @@
+"""What is left when the best known effects are in the model: is it more than noise, and what?
+
+A model that fits leaves errors that no torque explains better than noise does, that do not repeat
+when a motion is repeated, and whose squares add up to what the noise floor says. Where they do not,
+the torque that is missing is looked for in laws of what the servo sees and does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.fitting import fit_together
+from pup.diagnosis.impulses import BUDGET, responses
+from pup.diagnosis.lawfit import Law, laws
+from pup.diagnosis.locate import BAND, MissingInput, explained_by
+from pup.diagnosis.regimes import Regime, strongest, windows
+from pup.diagnosis.residuals import Measured
+from pup.diagnosis.selection import KEPT, Model, Selector
+from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter
+from pup.physics.terms import Place
+from pup.physics.terms.learned import LearnedLaw, unit
+from pup.robot import TermSpec
+
+Array = NDArray[np.float64]
+
+EVIDENCE = 10.0
+"""Logarithm of odds from which a missing torque is believed."""
+SURPRISE = 4.5
+"""Standard deviations from which errors are more than noise."""
+MATERIAL = 0.09
+"""Mean square of a channel's unexplained errors, in that of its noise, that matters."""
+UNSURE = {"repeats": 0.05, "assumed": 0.15}
+"""By what share the noise floor's variance may be wrong."""
+BLOCK = 0.5
+"""Errors nearer than this in time are not taken for independent, s."""
+FEWEST = 40
+"""Samples of a channel below which nothing is said of it."""
+SHARED = 0.6
+"""A law that this share of all joints asks for is the robot's."""
+
+
+@dataclass(frozen=True)
+class Lack:
+    """How far a channel's errors are from noise.
+
+    Attributes:
+      channel: which.
+      excess: mean square of its whitened errors, less 1.
+      surprise: by how many standard deviations that is above 0.
+      repeated: mean product of the errors of repeats, which noise leaves at 0; None without any.
+      repeated_surprise: by how many standard deviations that is above 0.
+      explained: mean square of what missing torques would explain of it.
+    """
+
+    channel: int
+    excess: float
+    surprise: float
+    repeated: float | None
+    repeated_surprise: float
+    explained: float
+
+
+@dataclass(frozen=True, eq=False)
+class Unexplained:
+    """Something that the library does not explain.
+
+    Attributes:
+      finding: as it is told.
+      missing: the torques that are missing with the known effects in the model.
+      lacks: the errors of each channel.
+      laws: the best laws, in words, best first; not yet tried in the simulator.
+      model: the model with the law, fitted; the one given where no law holds.
+      terms: what stands for the law in a robot's description.
+    """
+
+    finding: Finding
+    missing: MissingInput
+    lacks: tuple[Lack, ...]
+    laws: tuple[str, ...]
+    model: Model
+    terms: tuple[TermSpec, ...]
+
+
+def unexplained(
+    model: Model, selector: Selector, found: Sequence[Regime], budget: int = BUDGET
+) -> Unexplained | None:
+    """Look at what a selected model leaves; None where it is noise or does not matter.
+
+    Args:
+      model: what selection has left, with its Jacobian.
+      selector: knows the replays, the noise and the folds.
+      found: the regimes of motion.
+      budget: sub-steps of simulation for the missing torques.
+    """
+    replays, fit = selector.replays, model.fit
+    measured = replays.measured
+    assert fit.residual is not None
+    answers = responses(fit, replays, selector.noise, budget)
+    missing = explained_by(answers, fit)
+    lacks = lack_of_fit(measured, fit.residual, missing, UNSURE[selector.noise.source])
+    flagged = [lack for lack in lacks if _matters(lack, missing)]
+    if not flagged:
+        return None
+    place, joints = _place(measured, missing, flagged)
+    tried: list[Law] = []
+    if joints:
+        tried = laws(answers, fit, replays, replays([fit.row()])[0], joints)
+    best = _kept(tried, place, model, selector)
+    after = fit.residual - missing.explained if best is None else best[1].fit.residual
+    assert after is not None
+    gain = fit.residual**2 - after**2
+    law, corrected = (None, model) if best is None else best
+    return Unexplained(
+        Finding(
+            effect="unknown",
+            place=place,
+            regime=strongest(found, gain),
+            when=tuple(windows(measured, gain)),
+            parameters={} if law is None else _parameters(law, place, corrected),
+            probability=1 - UNKNOWN,
+            equivalents=(),
+            absorbed_by={},
+            law=None if law is None else str(law),
+            gain=float(gain.sum()),
+        ),
+        missing,
+        tuple(lacks),
+        tuple(str(one) for one in tried),
+        corrected,
+        () if law is None else (_term(law, place),),
+    )
+
+
+def lack_of_fit(
+    measured: Measured, residual: Array, missing: MissingInput, unsure: float
+) -> list[Lack]:
+    """How far each channel's errors are from noise.
+
+    Args:
+      measured: the samples.
+      residual: whitened, shape (n_samples,).
+      missing: the torques that would explain it.
+      unsure: share by which the noise's variance may be wrong.
+    """
+    together = _products(measured, residual)
+    told = []
+    for channel in range(measured.channels):
+        own = measured.channel == channel
+        if own.sum() < FEWEST:
+            continue
+        squares = residual[own] ** 2 - 1
+        blocks = measured.recording[own] * 10_000 + (measured.time[own] / BLOCK).astype(np.int64)
+        _, number = np.unique(blocks, return_inverse=True)
+        sums = np.bincount(number, squares - squares.mean())
+        excess = float(squares.mean())
+        spread = float(np.sqrt((sums**2).sum())) / len(squares)
+        products, known = together.get(channel, (np.empty(0), np.empty(0)))
+        repeated = float(products.mean()) if len(products) >= FEWEST else None
+        told.append(
+            Lack(
+                channel,
+                excess,
+                excess / float(np.hypot(spread, unsure)),
+                repeated,
+                0.0 if repeated is None else float(products.sum() / np.sqrt((known**2).sum())),
+                float(np.mean(missing.explained[own] ** 2)),
+            )
+        )
+    return told
+
+
+def _products(measured: Measured, residual: Array) -> dict[int, tuple[Array, Array]]:
+    """Products of the errors of repeats by channel, and the second's errors alone."""
+    pairs = repeats(measured)
+    told: dict[int, list[tuple[Array, Array]]] = {}
+    for first, second in pairs:
+        for channel in range(measured.channels):
+            one, other = (
+                (measured.recording == n) & (measured.channel == channel) for n in (first, second)
+            )
+            if min(one.sum(), other.sum()) < FEWEST:
+                continue
+            matched = np.interp(measured.time[one], measured.time[other], residual[other])
+            told.setdefault(channel, []).append((residual[one] * matched, matched))
+    return {
+        c: (np.hstack([p for p, _ in v]), np.hstack([m for _, m in v])) for c, v in told.items()
+    }
+
+
+def repeats(measured: Measured) -> list[tuple[int, int]]:
+    """Pairs of recordings of one motion, the second a repeat of the first."""
+    names = {r.id: i for i, r in enumerate(measured.recordings)}
+    return [
+        (names[r.repeat_of], i)
+        for i, r in enumerate(measured.recordings)
+        if r.repeat_of is not None and r.repeat_of in names
+    ]
+
+
+def _matters(lack: Lack, missing: MissingInput) -> bool:
+    """Whether a channel's errors are more than noise, and large enough to care."""
+    joint = lack.channel < len(missing.evidence) - 6
+    believed = joint and missing.evidence[lack.channel] > EVIDENCE and lack.explained > MATERIAL
+    repeated = lack.repeated_surprise > SURPRISE and (lack.repeated or 0.0) > MATERIAL
+    return bool(believed or repeated or (lack.surprise > SURPRISE and lack.excess > MATERIAL))
+
+
+def _place(
+    measured: Measured, missing: MissingInput, flagged: Sequence[Lack]
+) -> tuple[Place, list[int]]:
+    """Where it is, and the joints that a law would act on."""
+    robot = measured.robot
+    joints = len(robot.joints)
+    strong = [i for i in range(joints) if missing.evidence[i] > EVIDENCE]
+    best = int(np.argmax(missing.evidence))
+    if missing.evidence[best] <= EVIDENCE:  # no torque explains it: a sensor, or what is too fast
+        worst = max(flagged, key=lambda lack: lack.surprise + lack.repeated_surprise)
+        if worst.channel >= joints:
+            return Place("sensor"), []
+        return Place("joint", robot.joint_names[worst.channel]), [worst.channel]
+    if best >= joints:
+        return Place("body", robot.torso or ""), []
+    if len(strong) > max(1, SHARED * joints):
+        return Place("robot"), list(range(joints))
+    group = robot.group_index[best]
+    members = [int(i) for i in np.flatnonzero(robot.group_index == group)]
+    if len(members) > 1 and set(members) <= set(strong):
+        return Place("group", robot.groups[group]), members
+    return Place("joint", robot.joint_names[best]), [best]
+
+
+def _kept(
+    tried: Sequence[Law], place: Place, model: Model, selector: Selector
+) -> tuple[Law, Model] | None:
+    """The law that predicts motions left out best, refitted; None where none predicts them."""
+    fits = [law.started(model.fit, place) for law in tried]
+    fit_together(fits, selector.replays, selector.noise, iterations=8)
+    kept: list[tuple[float, Law, Model]] = []
+    for law, fit in zip(tried, fits, strict=True):
+        inside = model.fit.chi2 - fit.chi2
+        if inside <= selector.enough:
+            continue
+        after = selector.model(model.hypotheses, fit)
+        outside = float((model.held_out - after.held_out).sum())
+        if outside > max(KEPT * inside, 0.5 * selector.enough):
+            values = tuple(fit.values[name] for name in law.columns(place))
+            kept.append((outside, Law(law.features, values, inside), after))
+    if not kept:
+        return None
+    _, law, corrected = max(kept, key=lambda told: told[0])
+    return law, corrected
+
+
+def _parameters(law: Law, place: Place, model: Model) -> dict[str, Parameter]:
+    """The law's coefficients with their 90 % intervals."""
+    deviation = np.sqrt(np.diag(model.fit.covariance()))
+    told = {}
+    for feature, name in zip(law.features, law.columns(place), strict=True):
+        i = model.fit.names.index(name)
+        coordinate, at = model.fit.coordinates[i], float(model.fit.at[i])
+        ends = (at - BAND * float(deviation[i]), at + BAND * float(deviation[i]))
+        told[feature] = Parameter(
+            coordinate.value(at), unit(feature), *(coordinate.value(e) for e in ends)
+        )
+    return told
+
+
+def _term(law: Law, place: Place) -> TermSpec:
+    values = dict(zip(law.features, law.coefficients, strict=True))
+    return TermSpec(LearnedLaw.effect, place.kind, place.name, values)

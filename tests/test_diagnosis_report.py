@@ -1,0 +1,297 @@
+"""The report of a diagnosis: sentences, sections, figures, and what must not be in it."""
+
+import base64
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from diagnoses import Maker
+from test_report import Page
+
+from pup.diagnosis import summary
+from pup.diagnosis.drawing import draw_robot
+from pup.diagnosis.engine import Diagnosis
+from pup.diagnosis.laws import WORDS
+from pup.diagnosis.nominal import Certificate
+from pup.diagnosis.report import write_report
+from pup.diagnosis.sentences import sentence
+from pup.diagnosis.wording import Speech, percent, shift, spoken
+from pup.physics.terms import TERMS, Place
+from pup.robot import RobotDescription, built_in_robots
+from pup.sysid.accuracy import JointUnits
+from pup.sysid.figures import drawing_style
+
+NEXT = {
+    "motion": "a slow triangle",
+    "reason": "it crosses zero load",
+    "splits": [["backlash", "dead_band"]],
+}
+PLACES = {
+    "joint": Place("joint", "l_knee"),
+    "group": Place("group", "hip"),
+    "body": Place("body", "body"),
+    "foot": Place("foot", "l_ank_roll_link"),
+    "ground": Place("ground"),
+    "sensor": Place("sensor"),
+    "bus": Place("bus"),
+    "robot": Place("robot"),
+}
+
+
+@pytest.fixture(scope="module")
+def op2() -> Maker:
+    return Maker(RobotDescription.load("darwin_op2"), ticks=20, most=2)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Maker:
+    return Maker(RobotDescription.load("servo_bench"))
+
+
+@pytest.fixture(scope="module")
+def backlash() -> Diagnosis:
+    leg = Maker(RobotDescription.load("darwin_leg"), ticks=60, most=30)
+    return leg.missing("backlash", PLACES["joint"], gap=0.008)
+
+
+def speech(diagnosis: Diagnosis) -> Speech:
+    units = JointUnits.of(diagnosis.robot, diagnosis.measured.recordings)
+    return Speech(diagnosis.robot, units)
+
+
+def told(maker: Maker, effect: str, place: Place, **sizes: float) -> str:
+    """The sentence about an effect."""
+    diagnosis = maker.missing(effect, place, **sizes)
+    return sentence(diagnosis, diagnosis.findings[0], speech(diagnosis))
+
+
+def page(diagnosis: Diagnosis, folder: Path, provenance: dict[str, Any] | None = None) -> Page:
+    path = folder / "report.html"
+    write_report(diagnosis, path, provenance or {})
+    return Page(path)
+
+
+def headings(shown: Page) -> list[str]:
+    return re.findall("<h2>(.*?)</h2>", shown.source)
+
+
+def test_names_are_spoken() -> None:
+    assert spoken("l_knee") == "left knee"
+    assert spoken("l_ank_pitch") == "left ankle pitch"
+    assert spoken("FR_thigh_joint") == "front right thigh"
+    assert spoken("servo") == "servo"
+
+
+def test_numbers_are_readable() -> None:
+    assert percent(0.314) == "31 %"
+    assert percent(0.0531) == "5.3 %"
+    assert percent(1e-5) == "0 %"
+    assert shift(0.31) == "31 % too high"
+    assert shift(-0.2) == "20 % too low"
+    assert shift(9.0) == "10 times what it should be"
+
+
+def test_sentences_name_place_and_size(op2: Maker) -> None:
+    knee, bus = PLACES["joint"], PLACES["bus"]
+    assert told(op2, "backlash", knee, gap=0.008) == (
+        "The left knee loses 0.92° at every load reversal: gear backlash."
+    )
+    assert told(op2, "command_delay", bus, time=0.012) == (
+        "Commands to all servos arrive 12 ms late."
+    )
+    assert told(op2, "torque_speed_limit", PLACES["group"]).startswith(
+        "The faster the hip joints turn, the weaker the motor"
+    )
+    assert "12 mm away" in told(op2, "com_offset", PLACES["body"], x=0.012, y=0.0, z=0.0)
+    assert "50 g less" in told(op2, "payload", PLACES["body"], mass=-0.05)
+    assert told(op2, "ground_friction", PLACES["foot"], change=-0.3).startswith(
+        "The left foot grips worse"
+    )
+
+
+def test_a_sliding_joint_is_told_in_millimetres() -> None:
+    emps = Maker(RobotDescription.load("emps"))
+    words = told(emps, "backlash", Place("joint", "axis"), gap=0.0005)
+    assert words == "The axis loses 1 mm at every load reversal: gear backlash."
+    assert " N works" in told(emps, "coulomb_friction", Place("joint", "axis"), torque=20.0)
+
+
+@pytest.mark.parametrize("effect", TERMS)
+def test_every_effect_has_a_sentence(op2: Maker, effect: str) -> None:
+    words = told(op2, effect, PLACES[TERMS[effect].kinds[0]])
+    assert words[0].isupper() and words.endswith(".")
+    assert re.search(r"\d", words)
+    assert not re.search(r"nan|inf\b|\de[-+]|_", words)
+    assert len(words) < 200
+
+
+def test_every_effect_is_in_words() -> None:
+    assert set(TERMS) < set(WORDS)
+
+
+def test_a_cause_out_of_the_library_is_told(backlash: Diagnosis, tmp_path: Path) -> None:
+    unknown = replace(
+        backlash.findings[0], effect="unknown", parameters={}, law=None, equivalents=()
+    )
+    shown = page(replace(backlash, findings=(unknown,)), tmp_path)
+    assert "Something that none of the known effects explains happens at the left knee." in (
+        shown.text
+    )
+    assert "In the simulator:" not in shown.text
+
+
+def test_report_of_a_mismatch(backlash: Diagnosis, tmp_path: Path) -> None:
+    shown = page(
+        backlash, tmp_path, {"command": "pup diagnose <x>", "next_recording": NEXT, "seed": 0}
+    )
+    assert headings(shown) == [
+        "What is missing",
+        "Where",
+        "Before and after",
+        "When the model is off",
+        "Evidence",
+        "What could hide",
+        "What to record next",
+        "The nominal fit",
+        "Provenance",
+    ]
+    assert "The left knee loses 0.92° at every load reversal" in shown.text
+    assert "Your fit hid it in the damping kd of the hip (31 % too high)." in shown.text
+    assert "falls from 6.0 mrad (0.34°) to 2.0 mrad (0.11°)" in shown.text
+    assert "gear backlash from a dead band of the controller" in shown.text
+    assert ["command", "pup diagnose <x>"] in shown.table("What")
+    assert "next_recording" not in shown.text
+    finalists = shown.table("Finalist")
+    assert finalists[1][0] == "backlash, left knee" and finalists[1][-1] == "was added"
+    parameters = {row[0]: row for row in shown.table("Parameter")}
+    assert parameters["damping kd of the hip"][-1].startswith("0 %")
+    assert len(shown.table("Recording")) == 4
+
+
+def test_figures_are_self_contained_and_told(backlash: Diagnosis, tmp_path: Path) -> None:
+    shown = page(backlash, tmp_path)
+    images = shown.all("img")
+    assert len(images) >= 12
+    for image in images:
+        kind, _, data = image["src"].partition(",")
+        assert kind == "data:image/svg+xml;base64"
+        svg = base64.b64decode(data)
+        assert ElementTree.fromstring(svg).tag.endswith("svg")
+        links = re.findall(r'(?:href|src)="([^"#][^"]*)"', svg.decode())
+        assert all(link.startswith("data:image/png") for link in links)
+        assert image["alt"]
+    assert shown.source.count("<figcaption>") == len(images)
+    linked = [e.get("href", e.get("src", "")) for _, e in shown.elements]
+    assert all(link.startswith(("#", "data:")) for link in linked if link)
+    assert not shown.all("script") and not shown.all("link")
+    assert len(shown.source) < 1_500_000
+    targets = {link["href"][1:] for link in shown.all("a")}
+    assert targets == {section["id"] for section in shown.all("section")}
+
+
+def test_report_is_the_same_every_time(bench: Maker, tmp_path: Path) -> None:
+    diagnosis = bench.nothing()
+    first, second = (page(diagnosis, tmp_path / name).source for name in ("a", "b"))
+    assert first == second
+
+
+def test_report_of_nothing_missing(bench: Maker, tmp_path: Path) -> None:
+    diagnosis = bench.nothing()
+    shown = page(diagnosis, tmp_path)
+    limit = 1000 * summary.smallest_material(diagnosis)
+    assert f"Nothing material is missing from the simulator beyond {limit:.2g} mrad" in shown.text
+    assert "will do for motions like these" in shown.text
+    assert "measured from repeats" in shown.text
+    found = headings(shown)
+    assert "What is missing" not in found and "Provenance" not in found
+    assert "Errors on motions left out" in found
+    assert len(shown.table("Effect")) > 5  # what would not have been seen
+
+
+def test_assumed_noise_is_admitted(bench: Maker, tmp_path: Path) -> None:
+    diagnosis = bench.nothing()
+    noise = replace(diagnosis.noise, source="assumed")
+    diagnosis = replace(diagnosis, nominal=replace(diagnosis.nominal, noise=noise))
+    assert "the noise level is assumed" in page(diagnosis, tmp_path).text
+
+
+def test_an_error_that_nothing_explains_is_admitted(bench: Maker, tmp_path: Path) -> None:
+    shown = page(bench.nothing(2.9), tmp_path)
+    assert "No known effect is missing, but the simulator is off by 2.9 times" in shown.text
+    assert "will do for motions like these" not in shown.text
+
+
+def test_report_of_undetermined(bench: Maker, tmp_path: Path) -> None:
+    diagnosis = bench.nothing()
+    nominal = replace(diagnosis.nominal, certificate=Certificate((100.0, 250.0), False, 0.0))
+    bare = replace(
+        diagnosis,
+        verdict="undetermined",
+        reason="the nominal fit does not settle",
+        nominal=nominal,
+        held_out=None,
+        model=None,
+        found=(),
+        enough=0.0,
+    )
+    shown = page(bare, tmp_path)
+    assert "These recordings cannot tell whether anything is missing." in shown.text
+    assert "The nominal fit does not settle." in shown.text
+    assert "Record at least two types of motion" in shown.text
+    assert "do not agree" in shown.text
+    assert headings(shown) == ["Where", "When the model is off", "The nominal fit"]
+    advised = page(bare, tmp_path, {"next_recording": NEXT})
+    assert "Record at least two types of motion" not in advised.text
+    assert "a slow triangle" in advised.text
+
+
+def test_a_finding_that_was_not_added_is_told(backlash: Diagnosis, tmp_path: Path) -> None:
+    chosen = replace(backlash.rounds[0], accepted=False)
+    before = chosen.before
+    shown = page(
+        replace(backlash, verdict="none", findings=(), model=before, rounds=(chosen,)), tmp_path
+    )
+    assert "Closest was gear backlash at the left knee" in shown.text
+
+
+def test_two_findings_are_listed(backlash: Diagnosis, tmp_path: Path) -> None:
+    first = backlash.findings[0]
+    second = replace(first, place=Place("joint", "l_hip_yaw"), probability=0.5)
+    shown = page(replace(backlash, findings=(first, second)), tmp_path)
+    assert "The simulator lacks 2 effects." in shown.text
+    assert "Your fit hid them in" in shown.text
+    assert "The left hip yaw loses" in shown.text
+
+
+def test_a_likely_finding_is_told_as_such(backlash: Diagnosis, tmp_path: Path) -> None:
+    unsure = replace(backlash.findings[0], probability=0.5)
+    shown = page(replace(backlash, findings=(unsure,)), tmp_path)
+    assert "Most likely: The left knee loses" in shown.text
+
+
+@pytest.mark.parametrize("name", built_in_robots())
+def test_robots_are_drawn(name: str) -> None:
+    robot = RobotDescription.load(name)
+    joint = robot.joint_names[0]
+    places = [Place("joint", joint), Place("joint", joint), Place("group", robot.groups[0])]
+    places += [Place(kind) for kind in ("bus", "robot", "ground", "sensor")]
+    places += [Place("foot", foot) for foot in robot.feet]
+    places += [Place("body", robot.torso)] if robot.torso else []
+    with drawing_style():
+        support = "suspended" if robot.floating else "bench"
+        drawing = draw_robot(robot, support, places, {joint: 3.0})
+    texts = "".join(ElementTree.fromstring(drawing.svg).itertext())
+    assert all(str(number) in texts for number in range(1, len(places) + 1))
+    assert drawing.width == pytest.approx(442, abs=1)
+
+
+def test_why_finalists_fell_behind(backlash: Diagnosis) -> None:
+    best, other = summary.rivals(backlash.rounds[0])
+    assert "less of motions left out" in summary.why_behind(other, best)
+    lost = replace(other, outside=0.1 * other.inside)
+    assert summary.why_behind(lost, best) == "fits these motions but does not predict others"
+    near = replace(other, probability=0.2)
+    assert "hardly to be told apart" in summary.why_behind(near, best)
