@@ -298,7 +298,9 @@ class _Report:
         if not self.next:
             return
         yield tag("p", tag("strong", "Motion: "), str(self.next.get("motion", "")))
-        yield tag("p", capital(str(self.next.get("reason", ""))))
+        reason = str(self.next.get("reason", "")).removesuffix(".")
+        if reason:
+            yield tag("p", f"{capital(reason)}.")
         pairs = [tag("li", f"{_named(a)} from {_named(b)}") for a, b in self.next.get("splits", ())]
         if pairs:
             yield tag("p", "It would tell")
