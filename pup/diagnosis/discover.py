@@ -6,14 +6,14 @@ the torque that is missing is looked for in laws of what the servo sees and does
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.impulses import BUDGET, responses
-from pup.diagnosis.lawfit import Law, laws
+from pup.diagnosis.lawfit import LAWS, Law, laws
 from pup.diagnosis.locate import BAND, MissingInput, explained_by
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
@@ -127,7 +127,7 @@ def unexplained(
         ),
         missing,
         tuple(lacks),
-        tuple(str(one) for one in tried),
+        tuple(str(one) for one in tried[:LAWS]),
         corrected,
         () if law is None else (_term(law, place),),
     )
@@ -246,7 +246,8 @@ def _kept(
         outside = float((model.held_out - after.held_out).sum())
         if outside > max(KEPT * inside, 0.5 * selector.enough):
             values = tuple(fit.values[name] for name in law.columns(place))
-            kept.append((outside, Law(law.features, values, inside), after))
+            worth = (inside + outside) / 2 - law.price * len(values)
+            kept.append((worth, replace(law, coefficients=values), after))
     if not kept:
         return None
     _, law, corrected = max(kept, key=lambda told: told[0])

@@ -39,11 +39,13 @@ class Law:
       features: their names.
       coefficients: N m per unit of each feature.
       gain: drop of chi-squared that it promises, less what its length costs.
+      price: what one feature costs.
     """
 
     features: tuple[str, ...]
     coefficients: tuple[float, ...]
     gain: float
+    price: float
 
     def __str__(self) -> str:
         parts = [
@@ -68,7 +70,7 @@ class Law:
 def laws(
     answers: Responses, fit: Fit, replays: Replays, simulated: Array, joints: Sequence[int]
 ) -> list[Law]:
-    """Laws that explain a fit's errors, best first.
+    """Laws that explain a fit's errors: the best, best first, then those of one feature.
 
     Args:
       answers: of the samples to torques.
@@ -94,17 +96,18 @@ def laws(
     gram = units.T @ units
     found: dict[frozenset[str], Law] = {}
     for first in _beginnings(match, gram):
-        chosen = _grown(first, match, gram, price)
-        weights = np.linalg.solve(gram[np.ix_(chosen, chosen)], match[chosen])
-        gain = float(weights @ match[chosen]) - price * len(chosen)
-        law = Law(
-            tuple(names[i] for i in chosen),
-            tuple(float(w * sizes[i]) for w, i in zip(weights, chosen, strict=True)),
-            gain,
-        )
-        if gain > 0:
-            found.setdefault(frozenset(law.features), law)
-    return sorted(found.values(), key=lambda law: -law.gain)[:LAWS]
+        grown = _grown(first, match, gram, price)
+        for count in range(1, len(grown) + 1):
+            chosen = grown[:count]
+            weights = np.linalg.solve(gram[np.ix_(chosen, chosen)], match[chosen])
+            gain = float(weights @ match[chosen]) - price * count
+            if gain > 0:
+                coefficients = tuple(float(w) for w in weights * sizes[chosen])
+                law = Law(tuple(names[i] for i in chosen), coefficients, gain, price)
+                found.setdefault(frozenset(law.features), law)
+    ranked = sorted(found.values(), key=lambda law: -law.gain)
+    simple = [law for law in ranked if len(law.features) == 1]
+    return list(dict.fromkeys(ranked[:LAWS] + simple[:LAWS]))
 
 
 def _lengths(columns: Array) -> Array:

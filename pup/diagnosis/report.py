@@ -301,7 +301,11 @@ class _Report:
         reason = str(self.next.get("reason", "")).removesuffix(".")
         if reason:
             yield tag("p", f"{capital(reason)}.")
-        pairs = [tag("li", f"{_named(a)} from {_named(b)}") for a, b in self.next.get("splits", ())]
+        pairs = [
+            tag("li", f"{_named(a)} from {_named(b)}")
+            for a, b in self.next.get("splits", ())
+            if a != b
+        ]
         if pairs:
             yield tag("p", "It would tell")
             yield tag("ul", *pairs)
