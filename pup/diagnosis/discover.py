@@ -243,6 +243,9 @@ def _kept(
         if inside <= selector.enough:
             continue
         after = selector.model(model.hypotheses, fit)
+        deviation = np.sqrt(np.diag(fit.covariance()))[-len(law.features) :]
+        if (np.abs(fit.at[-len(law.features) :]) < BAND * deviation).any():
+            continue  # a part of it is not needed
         outside = float((model.held_out - after.held_out).sum())
         if outside > max(KEPT * inside, 0.5 * selector.enough):
             values = tuple(fit.values[name] for name in law.columns(place))

@@ -37,7 +37,7 @@ def _certificate(diagnosis: Diagnosis) -> str:
         "An optimiser that stops short looks like missing physics, so the fit is checked twice. "
         f"From {counted(len(told.starts), 'start')} it ends at chi-squared {ends}: the best two "
         f"{'agree' if told.agree else 'do not agree'}. Fitted to a simulation of itself it comes "
-        f"back to within {digits(told.recovered, 1)} standard deviations ({SELF:g} are allowed)."
+        f"back to within {max(told.recovered, 0.1):.1f} standard deviations ({SELF:g} are allowed)."
     )
 
 
