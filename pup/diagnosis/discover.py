@@ -37,6 +37,8 @@ BLOCK = 0.5
 """Errors nearer than this in time are not taken for independent, s."""
 FEWEST = 40
 """Samples of a channel below which nothing is said of it."""
+ITERATIONS = 14
+"""Steps of a law's refit, at most: it may start far from where it ends."""
 SHARED = 0.6
 """A law that this share of all joints asks for is the robot's."""
 
@@ -236,7 +238,7 @@ def _kept(
 ) -> tuple[Law, Model] | None:
     """The law that predicts motions left out best, refitted; None where none predicts them."""
     fits = [law.started(model.fit, place) for law in tried]
-    fit_together(fits, selector.replays, selector.noise, iterations=8)
+    fit_together(fits, selector.replays, selector.noise, iterations=ITERATIONS)
     kept: list[tuple[float, Law, Model]] = []
     for law, fit in zip(tried, fits, strict=True):
         inside = model.fit.chi2 - fit.chi2

@@ -2,7 +2,7 @@
 
 A law is a sum of features of what a servo sees and does, each times a coefficient with a unit of
 its own. Every feature is a quantity of the term, so that a law stands in a robot's description as
-what it is: `values = { "sgn(v)*|u|" = -0.12 }`.
+what it is: `values = { "|u|*sgn(v)" = -0.12 }`.
 """
 
 from collections.abc import Callable, Mapping
