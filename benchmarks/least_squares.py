@@ -172,8 +172,9 @@ class _Rollouts:
         self.armature = names["armature"]
         plans = [schedule(r, robot.joint_names, robot.timestep) for r in recordings]
         longest = max(plan.steps for plan in plans)
-        held = [np.minimum(np.arange(longest), plan.steps - 1) for plan in plans]
-        self.control = np.stack([p.target[rows] for p, rows in zip(plans, held, strict=True)])
+        grid = np.arange(longest) * robot.timestep
+        held = [np.searchsorted(plan.time, grid, "right") - 1 for plan in plans]
+        self.control = np.stack([p.held[rows] for p, rows in zip(plans, held, strict=True)])
         model = compile_model(robot, "suspended")
         self.start = np.stack(
             [

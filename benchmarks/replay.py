@@ -16,6 +16,7 @@ import resource
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import Any
 
 import mujoco.batch
 import numpy as np
@@ -25,6 +26,8 @@ from pup.physics.actuators import LAWS, Array
 from pup.physics.fields import apply_fields, scaled
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import Candidates, robot_space
+from pup.physics.servo import Servos
+from pup.physics.writer import FieldWriter
 from pup.robot import RobotDescription
 
 BATCHES = (16, 64)
@@ -111,32 +114,27 @@ def _bare_informed(
 ) -> Callable[[], None]:
     """A loop of the engine through the motion of a replay."""
     (group,) = simulator.groups
-    robot, dofs, inner = simulator.robot, group.model.dofs, LAWS[actuator]
+    robot, dofs = simulator.robot, group.model.dofs
     torques: list[tuple[Array, Array]] = []
+    usual = Servos.torque
 
-    class Kept:
-        """A torque law that keeps what it says."""
+    def kept(*given: Any, **more: Any) -> tuple[Array, Array]:
+        torque, damping = usual(*given, **more)
+        torques.append((torque.copy(), damping.copy()))
+        return torque, damping
 
-        def __init__(self, robot: RobotDescription, candidates: Candidates) -> None:
-            self.law = inner(robot, candidates)
-            self.armature, self.passive = self.law.armature, self.law.passive
-
-        def torque(self, error: Array, velocity: Array) -> tuple[Array, Array]:
-            torque, damping = self.law.torque(error, velocity)
-            torques.append((torque.copy(), damping.copy()))
-            return torque, damping
-
-    alone = MujocoSimulator(robot, simulator.recordings, actuator)  # one thread: one batch
-    alone.law = Kept  # type: ignore[assignment]
-    alone.replay(candidates)
+    Servos.torque = kept  # type: ignore[method-assign]
+    try:  # one thread: one batch
+        MujocoSimulator(robot, simulator.recordings, actuator).replay(candidates)
+    finally:
+        Servos.torque = usual  # type: ignore[method-assign]
+    del torques[0]  # that of the start
     per_simulation = scaled(robot, candidates, group.setups)
     batch = mujoco.batch.Batch(group.model.compiled, len(per_simulation), simulator.threads)
-    law = inner(robot, per_simulation)
-    viscous = law.passive + apply_fields(
-        batch, robot, group.model, per_simulation, group.setups, law.armature
-    )
-    for torque, damping in torques:
-        damping += viscous[: len(torque)]
+    law = LAWS[actuator](robot, per_simulation)
+    writer = FieldWriter(batch, group.model.compiled)
+    apply_fields(writer, robot, group.model, per_simulation, group.setups, law.armature)
+    writer.done()
     batch.qpos[:] = np.repeat(group.start, len(candidates), axis=0)
     force, damper = batch.bind("qfrc_applied"), batch.expand("dof_damping")
     state, ids = batch.state.copy(), np.arange(len(per_simulation), dtype=np.int32)

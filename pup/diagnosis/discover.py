@@ -72,7 +72,7 @@ class Unexplained:
       finding: as it is told.
       missing: the torques that are missing with the known effects in the model.
       lacks: the errors of each channel.
-      laws: the best laws, in words, best first; not yet tried in the simulator.
+      laws: the best laws in words, best first: those that hold, then those that were promising.
       model: the model with the law, fitted; the one given where no law holds.
       terms: what stands for the law in a robot's description.
     """
@@ -109,11 +109,12 @@ def unexplained(
     tried: list[Law] = []
     if joints:
         tried = laws(answers, fit, replays, replays([fit.row()])[0], joints)
-    best = _kept(tried, place, model, selector)
-    after = fit.residual - missing.explained if best is None else best[1].fit.residual
+    kept = _kept(tried, place, model, selector)
+    law, corrected = kept[0] if kept else (None, model)
+    after = fit.residual - missing.explained if law is None else corrected.fit.residual
     assert after is not None
     gain = fit.residual**2 - after**2
-    law, corrected = (None, model) if best is None else best
+    told = [str(one) for one, _ in kept] + [str(one) for one in tried]
     return Unexplained(
         Finding(
             effect="unknown",
@@ -129,7 +130,7 @@ def unexplained(
         ),
         missing,
         tuple(lacks),
-        tuple(str(one) for one in tried[:LAWS]),
+        tuple(told[:LAWS]),
         corrected,
         () if law is None else (_term(law, place),),
     )
@@ -235,8 +236,8 @@ def _place(
 
 def _kept(
     tried: Sequence[Law], place: Place, model: Model, selector: Selector
-) -> tuple[Law, Model] | None:
-    """The law that predicts motions left out best, refitted; None where none predicts them."""
+) -> list[tuple[Law, Model]]:
+    """The laws that predict motions left out, refitted, best first."""
     fits = [law.started(model.fit, place) for law in tried]
     fit_together(fits, selector.replays, selector.noise, iterations=ITERATIONS)
     kept: list[tuple[float, Law, Model]] = []
@@ -253,10 +254,7 @@ def _kept(
             values = tuple(fit.values[name] for name in law.columns(place))
             worth = (inside + outside) / 2 - law.price * len(values)
             kept.append((worth, replace(law, coefficients=values), after))
-    if not kept:
-        return None
-    _, law, corrected = max(kept, key=lambda told: told[0])
-    return law, corrected
+    return [(law, after) for _, law, after in sorted(kept, key=lambda told: -told[0])]
 
 
 def _parameters(law: Law, place: Place, model: Model) -> dict[str, Parameter]:
