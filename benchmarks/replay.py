@@ -30,7 +30,7 @@ from pup.physics.servo import Servos
 from pup.physics.writer import FieldWriter
 from pup.robot import RobotDescription
 
-BATCHES = (16, 64)
+BATCHES = (16, 64, 256)
 SIZES = (16, 64, 256, 1024, 4096)
 SPREAD = 0.02  # of the candidates around the nominal values
 SPRING, DAMPER = 15.0, 1.0  # N m/rad, N m s/rad

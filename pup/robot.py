@@ -23,6 +23,7 @@ from pup.robot_parts import (
     TermSpec,
 )
 from pup.robot_reader import (
+    read_actuator,
     read_feet,
     read_gait,
     read_groups,
@@ -75,6 +76,7 @@ class RobotDescription:
       terms: what the physics has beside the nominal model.
       gait: the reference motion, if any.
       network: options of the NN-PD actuator; None where it is not offered.
+      actuator: the torque law to use when none is asked for.
       timestep: physics step, s.
       digest: SHA-256 over robot.toml, model.xml and its includes.
     """
@@ -93,6 +95,7 @@ class RobotDescription:
     terms: tuple[TermSpec, ...]
     gait: Gait | None
     network: NetworkOptions | None
+    actuator: Actuator
     timestep: float
     digest: str
 
@@ -115,6 +118,7 @@ class RobotDescription:
         torso = read_torso(table, model)
         feet = read_feet(table, model)
         parameters = read_parameters(table, groups, torso, model)
+        network = read_network(table, parameters)
         robot = cls(
             name=table.name("name"),
             folder=folder.absolute(),
@@ -129,7 +133,8 @@ class RobotDescription:
             parameters=parameters,
             terms=read_terms(table, joints, groups, feet, model),
             gait=read_gait(table, joints),
-            network=read_network(table, parameters),
+            network=network,
+            actuator=read_actuator(table, network),
             timestep=read_timestep(table),
             digest=_digest((text, *model.texts)),
         )
@@ -149,11 +154,6 @@ class RobotDescription:
     def group_index(self) -> NDArray[np.intp]:
         """Position in `groups` of each joint's group, shape (n_joints,)."""
         return np.array([self.groups.index(joint.group) for joint in self.joints], dtype=np.intp)
-
-    @property
-    def actuator(self) -> Actuator:
-        """The torque law to use when none is asked for: NN-PD where the robot has a network."""
-        return "pd" if self.network is None else "nn_pd"
 
     @property
     def model_path(self) -> Path:

@@ -3,6 +3,7 @@
 from pup.robot_mjcf import MjcfNames, absent
 from pup.robot_parts import (
     NETWORK_WEIGHTS,
+    Actuator,
     Gait,
     Harmonics,
     Joint,
@@ -155,6 +156,20 @@ def read_poses(table: Table, joints: tuple[Joint, ...]) -> dict[str, tuple[float
         pose.close()
         poses[name] = tuple(values)
     return poses
+
+
+def read_actuator(table: Table, network: NetworkOptions | None) -> Actuator:
+    """Read the torque law to use by default; left out, NN-PD where the robot has a network."""
+    if not table.has("actuator"):
+        return "pd" if network is None else "nn_pd"
+    named = table.text("actuator")
+    if named == "pd":
+        return "pd"
+    if named != "nn_pd":
+        raise table.mistake("actuator", f"{named!r} is none; write 'pd' or 'nn_pd'")
+    if network is None:
+        raise table.mistake("actuator", "'nn_pd' needs a [network]")
+    return "nn_pd"
 
 
 def read_network(table: Table, parameters: tuple[ParameterSpec, ...]) -> NetworkOptions | None:

@@ -11,7 +11,7 @@ from pup.errors import InputError
 from pup.files import write_atomic
 from pup.robot import ROBOT_LIMIT, RobotDescription, TermSpec
 from pup.robot_mjcf import read_mjcf
-from pup.robot_parts import ParameterSpec
+from pup.robot_parts import Actuator, ParameterSpec
 from pup.robot_toml import read_text
 
 WEIGHT = "phi/"
@@ -23,6 +23,7 @@ def write_corrected(
     parameters: Mapping[str, float],
     terms: Sequence[TermSpec],
     notes: str = "",
+    actuator: Actuator = "pd",
 ) -> RobotDescription:
     """Write a robot that differs from another by its nominal parameters and its terms.
 
@@ -36,6 +37,7 @@ def write_corrected(
         range that does not contain its value is widened.
       terms: all the terms that the robot shall have.
       notes: comment at the head of `robot.toml`.
+      actuator: the torque law that they were found beside; the robot's default from then on.
 
     Returns:
       The robot as it reads back.
@@ -55,6 +57,8 @@ def write_corrected(
     for name, value in values.items():
         if name not in names:
             _set_weight(document, robot, name, value)
+    if robot.actuator != actuator:
+        document["actuator"] = actuator
     document.pop("term", None)
     if terms:
         document.append("term", _tables([_of_term(term) for term in terms]))

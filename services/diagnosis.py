@@ -73,7 +73,7 @@ def _write_corrected(found: Diagnosis, out: Path) -> str:
         for (effect, kind, name), given in terms.items()
     ]
     folder = out / "corrected"
-    write_corrected(found.robot, folder, values, known, "Corrected by `pup diagnose`.")
+    write_corrected(found.robot, folder, values, known, "Corrected by `pup diagnose`.", "pd")
     return str(folder)
 
 

@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.discover import Unexplained, unexplained
 from pup.diagnosis.evidence import Trace, threshold, traces
 from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import differentiate
 from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.nominal import Nominal, fit_nominal
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise, assumed_noise
 from pup.diagnosis.selection import Model, Round, Selector
+from pup.diagnosis.splits import Split, splits
 from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space
@@ -52,6 +55,10 @@ class Diagnosis:
       regimes: the regimes of motion.
       replays: candidates simulated.
       ask: what to record next; None where nothing is open, or nothing would settle it.
+      missing: the torques that the nominal model lacks; None where nothing is to be explained.
+      unexplained: what the known effects leave; None where that is noise.
+      splits: how the nominal model's parameters differ between halves of the data, and how those
+        of the model with what was found.
     """
 
     robot: RobotDescription
@@ -68,6 +75,9 @@ class Diagnosis:
     regimes: tuple[Regime, ...]
     replays: int
     ask: NextRecording | None = None
+    missing: MissingInput | None = None
+    unexplained: Unexplained | None = None
+    splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
 
     @property
     def noise(self) -> Noise:
@@ -133,17 +143,34 @@ def diagnose(
     selector = Selector(replays, nominal.noise, found, enough)
     progress("refits", 0.5)
     model, rounds = selector.run(nominal.fit)
-    evidence: dict[str, Any] = {"found": tuple(found), "enough": enough, "rounds": tuple(rounds)}
     before = rounds[0].before if rounds else model
-    errors = held_out(measured, before, model, seed)
-    if not model.hypotheses:
-        return told("none", held_out=errors, model=model, **evidence)
-    progress("findings", 0.9)
-    differentiate([model.fit], replays, nominal.noise)
-    named = findings(model, rounds, selector, measured, seen)
+    if model.fit.jacobian is None:
+        differentiate([model.fit], replays, nominal.noise)
+    progress("what is left", 0.8)
+    left = unexplained(model, selector, seen)
+    final = left.model if left else model
+    evidence: dict[str, Any] = {
+        "found": tuple(found),
+        "enough": enough,
+        "rounds": tuple(rounds),
+        "held_out": held_out(measured, before, final, seed),
+        "model": final,
+        "unexplained": left,
+    }
+    if not model.hypotheses and not left:
+        return told("none", **evidence)
+    progress("where", 0.87)
+    differentiate([final.fit], replays, nominal.noise)
+    evidence["missing"] = missing_input(nominal.fit, replays, nominal.noise)
+    evidence["splits"] = tuple(
+        splits(fit, replays, nominal.noise) for fit in (nominal.fit, final.fit)
+    )
+    progress("findings", 0.92)
+    named = findings(model, rounds, selector, measured, seen) if model.hypotheses else ()
     progress("next recording", 0.95)
     ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
-    return told("mismatch", findings=named, held_out=errors, model=model, ask=ask, **evidence)
+    evidence["findings"] = (*named, left.finding) if left else named
+    return told("mismatch", ask=ask, **evidence)
 
 
 def _next(

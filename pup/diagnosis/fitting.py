@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.probing import changes
+from pup.diagnosis.probing import changes, probed
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.physics.parameters import ParameterSpace
@@ -27,6 +27,8 @@ DAMPINGS = (0.1, 1.0, 10.0)
 ENOUGH = 0.05
 """A fit has ended when no step lowers chi-squared by as much."""
 ALMOST = 1e-9
+CHEAP = 400
+"""Simulations that a replay may have beside those it needs, for Jacobians of its trials."""
 PATIENCE = 2
 """Accepted steps for which an updated Jacobian is trusted."""
 
@@ -148,6 +150,9 @@ class Fit:
 def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations: int = 12) -> None:
     """Move some fits to their minima, in step.
 
+    Where simulations are so few that a replay costs the same with more, trials are simulated with
+    their differences, and every step has a fresh Jacobian.
+
     Args:
       fits: changed in place. One without a residual is replayed first; one with a Jacobian starts
         with it.
@@ -155,44 +160,79 @@ def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations
       noise: weighs the samples.
       iterations: at most this many steps of each.
     """
-    _evaluate([fit for fit in fits if fit.residual is None], replays, noise)
+    _begin([fit for fit in fits if fit.residual is None], replays, noise)
     for _ in range(iterations):
         moving = [fit for fit in fits if not fit.done]
         if not moving:
             return
         differentiate([fit for fit in moving if fit.jacobian is None], replays, noise)
         trials = [(fit, at) for fit in moving for at in _trials(fit)]
-        if not trials:
-            return
-        simulated = replays([fit.row(at) for fit, at in trials])
-        reached = _residuals([fit for fit, _ in trials], simulated, replays, noise)
+        reached = _reached(trials, replays, noise)
         for fit in moving:
-            mine = [i for i, (owner, _) in enumerate(trials) if owner is fit]
-            _take(fit, [(trials[i][1], reached[i]) for i in mine])
+            _take(
+                fit,
+                [told for (owner, _), told in zip(trials, reached, strict=True) if owner is fit],
+            )
 
 
 def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Give some fits fresh Jacobians where they stand."""
     if not fits:
         return
-    steps = [[_step(fit, i) for i in range(len(fit.coordinates))] for fit in fits]
-    asked = []
-    for fit, widths in zip(fits, steps, strict=True):
-        moved = zip(fit.coordinates, fit.at + widths, strict=True)
-        asked.append((fit.row(), [{c.name: c.value(x)} for c, x in moved]))
-    for fit, widths, changed in zip(fits, steps, changes(asked, replays), strict=True):
-        lost = np.isnan(changed).any(axis=1, keepdims=True)
-        white = replays.measured.whiten(np.where(lost, 0.0, changed), noise)
-        fit.jacobian = (white / np.array(widths)[:, None]).T
+    asked = [_differences(fit, fit.at) for fit in fits]
+    told = changes([(fit.row(), rows) for fit, (_, rows) in zip(fits, asked, strict=True)], replays)
+    for fit, (steps, _), changed in zip(fits, asked, told, strict=True):
+        fit.jacobian = _jacobian(steps, changed, replays, noise)
         fit.age = 0
 
 
-def _evaluate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+def _differences(fit: Fit, at: Array) -> tuple[Array, list[dict[str, float]]]:
+    """Steps of the coordinates around a point, and the column that each sets."""
+    steps = np.array([_step(fit, i, at) for i in range(len(at))])
+    moved = zip(fit.coordinates, at + steps, strict=True)
+    return steps, [{c.name: c.value(x)} for c, x in moved]
+
+
+def _jacobian(steps: Array, changed: Array, replays: Replays, noise: Noise) -> Array:
+    lost = np.isnan(changed).any(axis=1, keepdims=True)
+    white = replays.measured.whiten(np.where(lost, 0.0, changed), noise)
+    return np.asarray((white / steps[:, None]).T)
+
+
+def _reached(
+    trials: Sequence[tuple[Fit, Array]], replays: Replays, noise: Noise
+) -> list["_Reached"]:
+    """What some trials lead to, with Jacobians where those are cheap."""
+    fits = [fit for fit, _ in trials]
+    rows = [fit.row(at) for fit, at in trials]
+    more = sum(len(at) for _, at in trials) * len(replays.measured.recordings)
+    if more > CHEAP:
+        residuals = _residuals(fits, replays(rows), replays, noise)
+        return [_Reached(at, r, None) for (_, at), r in zip(trials, residuals, strict=True)]
+    asked = [_differences(fit, at) for fit, at in trials]
+    told = probed([(row, d) for row, (_, d) in zip(rows, asked, strict=True)], replays)
+    residuals = _residuals(fits, np.stack([base for base, _ in told]), replays, noise)
+    return [
+        _Reached(at, residual, _jacobian(steps, changed, replays, noise))
+        for (_, at), residual, (steps, _), (_, changed) in zip(
+            trials, residuals, asked, told, strict=True
+        )
+    ]
+
+
+def _begin(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Replay some fits where they stand, those without a Jacobian with their differences."""
     if not fits:
         return
-    values = _residuals(fits, replays([fit.row() for fit in fits]), replays, noise)
-    for fit, value in zip(fits, values, strict=True):
-        fit.residual, fit.chi2 = value, _chi2(fit, value)
+    asked = [
+        _differences(fit, fit.at) if fit.jacobian is None else (np.empty(0), []) for fit in fits
+    ]
+    told = probed([(fit.row(), rows) for fit, (_, rows) in zip(fits, asked, strict=True)], replays)
+    residuals = _residuals(fits, np.stack([base for base, _ in told]), replays, noise)
+    for fit, residual, (steps, _), (_, changed) in zip(fits, residuals, asked, told, strict=True):
+        fit.residual, fit.chi2 = residual, _chi2(fit, residual)
+        if fit.jacobian is None:
+            fit.jacobian, fit.age = _jacobian(steps, changed, replays, noise), 0
 
 
 def _residuals(fits: Sequence[Fit], simulated: Array, replays: Replays, noise: Noise) -> Array:
@@ -208,11 +248,11 @@ def _chi2(fit: Fit, residual: Array) -> float:
     return float(weighted @ weighted)
 
 
-def _step(fit: Fit, i: int) -> float:
+def _step(fit: Fit, i: int, at: Array) -> float:
     """A finite difference into the range."""
     coordinate = fit.coordinates[i]
     step = fit.width * (STEP if coordinate.scale is None else 5 * STEP)
-    return step if fit.at[i] + step <= coordinate.upper else -step
+    return step if at[i] + step <= coordinate.upper else -step
 
 
 def _trials(fit: Fit) -> list[Array]:
@@ -250,23 +290,24 @@ def _bounded(system: Array, gradient: Array, at: Array, lower: Array, upper: Arr
     return np.clip(at + step, lower, upper)
 
 
-def _take(fit: Fit, reached: Sequence[tuple[Array, Array]]) -> None:
+@dataclass(frozen=True, eq=False)
+class _Reached:
+    """Where a trial led: its coordinates, its residual and, if it was cheap, its Jacobian."""
+
+    at: Array
+    residual: Array
+    jacobian: Array | None
+
+
+def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
     """Go where a trial is best, or ask for a fresh Jacobian, or stop."""
-    costs = [_chi2(fit, residual) for _, residual in reached]
+    costs = [_chi2(fit, told.residual) for told in reached]
     best = int(np.argmin(costs))
     gain = fit.chi2 - costs[best]
     fresh = fit.age == 0
     if gain > 0:
-        at, residual = reached[best]
-        assert fit.jacobian is not None and fit.residual is not None
-        moved = at - fit.at
-        miss = (fit.residual - residual) - fit.jacobian @ moved
-        length = float(moved @ moved)
-        if length > 0:  # Broyden's update
-            fit.jacobian = fit.jacobian + np.outer(miss, moved) / length
-        fit.at, fit.residual, fit.chi2 = at, residual, costs[best]
+        _go(fit, reached[best], costs[best])
         fit.damping = float(np.clip(fit.damping * DAMPINGS[best], 1e-6, 1e6))
-        fit.age += 1
         fit.stuck = 0
     if gain > max(ENOUGH, 1e-5 * fit.chi2):
         if fit.age >= PATIENCE and fit.thorough:
@@ -279,3 +320,18 @@ def _take(fit: Fit, reached: Sequence[tuple[Array, Array]]) -> None:
     else:
         fit.jacobian = None
         fit.stuck = 0
+
+
+def _go(fit: Fit, to: _Reached, chi2: float) -> None:
+    """Stand where a trial led, with its Jacobian or an updated one."""
+    assert fit.jacobian is not None and fit.residual is not None
+    if to.jacobian is not None:
+        fit.jacobian, fit.age = to.jacobian, 0
+    else:
+        moved = to.at - fit.at
+        miss = (fit.residual - to.residual) - fit.jacobian @ moved
+        length = float(moved @ moved)
+        if length > 0:  # Broyden's update
+            fit.jacobian = fit.jacobian + np.outer(miss, moved) / length
+        fit.age += 1
+    fit.at, fit.residual, fit.chi2 = to.at, to.residual, chi2

@@ -25,9 +25,11 @@ ROUNDS = 15
 """Updates of the strengths."""
 NONE = 1e-3
 """Strength of a channel that lacks nothing, in the size of a push."""
+START = 0.5
+"""Strength of all channels to begin with, in the size of a push."""
 WEAK = 0.02
 """A channel that falls below this is left out from then on."""
-CHANGE = 8.0
+CHANGE = 50.0
 """A variance changes at most by this factor in one update."""
 BAND = 1.645
 """Standard deviations of a 90 % interval."""
@@ -260,7 +262,7 @@ class _Problem:
         self.loose = np.diag(12 / span**2)
         acting = np.unique(np.concatenate([limb.channels for limb in self.limbs]))
         self.strength = np.full(len(answers.channels), NONE)
-        self.strength[acting] = 1.0
+        self.strength[acting] = START
         self.acting = acting
         self.variance = 1.0
         recordings = range(len(answers.measured.recordings))

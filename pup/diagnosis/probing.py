@@ -20,14 +20,22 @@ Array = NDArray[np.float64]
 
 
 def changes(asked: Sequence[tuple[Row, Sequence[Row]]], replays: Replays) -> list[Array]:
-    """What probes change in the samples.
+    """What probes change in the samples; see `probed`."""
+    return [changed for _, changed in probed(asked, replays)]
+
+
+def probed(
+    asked: Sequence[tuple[Row, Sequence[Row]]], replays: Replays
+) -> list[tuple[Array, Array]]:
+    """Simulations of some rows, and what probes change in them, all in one replay.
 
     Args:
       asked: where some probes start, and the columns that each of them sets.
       replays: simulates.
 
     Returns:
-      For each of them the changes, shape (n_probes, n_samples), rad.
+      For each of them its samples, shape (n_samples,), and the changes, shape (n_probes,
+      n_samples), rad.
     """
     measured = replays.measured
     every = range(len(measured.recordings))
@@ -48,22 +56,25 @@ def changes(asked: Sequence[tuple[Row, Sequence[Row]]], replays: Replays) -> lis
             ([r for here, p in asked for r in (here, *({**here, **q} for q in p))], ground)
         )
     answers = iter(replays.together(calls))
-    out = [np.zeros((len(probes), len(measured.values))) for _, probes in asked]
+    n = len(measured.values)
+    out = [(np.zeros(n), np.zeros((len(probes), n))) for _, probes in asked]
     if fixed:
         told = next(answers)
         inside = measured.only(fixed)
         limb = limbs[measured.channel[inside]]
-        for (_, probes), packed, changed in zip(asked, packs, out, strict=True):
-            base, told = told[0], told[1:]
+        for (_, probes), packed, (base, changed) in zip(asked, packs, out, strict=True):
+            base[inside], told = told[0], told[1:]
             for pack in packed:
-                change, told = told[0] - base, told[1:]
+                change, told = told[0] - base[inside], told[1:]
                 for i in pack:
                     mine = np.isin(limb, list(_reach(probes[i], measured.robot, limbs)))
                     changed[i, inside] = np.where(mine, change, 0.0)
     if ground:
         told = next(answers)
-        for (_, probes), changed in zip(asked, out, strict=True):
-            changed[:, measured.only(ground)] = told[1 : 1 + len(probes)] - told[0]
+        inside = measured.only(ground)
+        for (_, probes), (base, changed) in zip(asked, out, strict=True):
+            base[inside] = told[0]
+            changed[:, inside] = told[1 : 1 + len(probes)] - told[0]
             told = told[1 + len(probes) :]
     return out
 

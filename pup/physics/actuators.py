@@ -86,7 +86,8 @@ class NetworkPD:
         options = robot.network or NetworkOptions()
         rho, sigma = (per_joint(robot, candidates, kind) for kind in ("rho", "sigma"))
         # Every joint gets its own copy of the weights: arrays of one shape multiply twice as fast.
-        phi = candidates.columns(NETWORK_NAMES).T
+        # So does single precision, whose 1e-7 of a gain is far below what gains are known to.
+        phi = candidates.columns(NETWORK_NAMES).T.astype(np.float32)
         weights = np.repeat(phi[:, :, None], rho.shape[1], axis=2)
         self.w_error = weights[0:5] * options.error_scale
         self.w_speed, self.bias = weights[5:10], weights[10:15]
@@ -94,7 +95,8 @@ class NetworkPD:
         # the weights once.
         self.w_out = weights[15:25].reshape(5, 2, *rho.shape) / 2
         self.b_out = weights[25:27] / 2
-        self.scale = np.stack([rho * (options.kp_scale / 2), sigma * (options.kd_scale / 2)])
+        halves = rho * (options.kp_scale / 2), sigma * (options.kd_scale / 2)
+        self.scale = np.stack(halves).astype(np.float32)
         self.limit = candidates["torque_limit"][:, None]
         self.passive = options.passive_damping
         self.steady = False
@@ -107,8 +109,9 @@ class NetworkPD:
         """Gains kp (N m/rad) and kd (N m s/rad), shape (n_active, n_joints)."""
         n = len(error)
         hidden, weighted = self._hidden[:, :n], self._weighted[:, :, :n]
-        np.multiply(self.w_error[:, :n], np.abs(error), out=hidden)
-        hidden += np.multiply(self.w_speed[:, :n], np.abs(velocity), out=weighted[:, 0])
+        error, velocity = (np.abs(a.astype(np.float32)) for a in (error, velocity))
+        np.multiply(self.w_error[:, :n], error, out=hidden)
+        hidden += np.multiply(self.w_speed[:, :n], velocity, out=weighted[:, 0])
         hidden += self.bias[:, :n]
         np.tanh(hidden, out=hidden)
         np.multiply(self.w_out[:, :, :n], hidden[:, None], out=weighted)
@@ -118,7 +121,7 @@ class NetworkPD:
         np.tanh(gains, out=gains)
         gains += 1
         gains *= self.scale[:, :n]
-        return gains[0], gains[1]
+        return gains[0].astype(np.float64), gains[1].astype(np.float64)
 
     def unlimited(self, error: Array, velocity: Array) -> tuple[Array, Array]:
         """See TorqueLaw."""

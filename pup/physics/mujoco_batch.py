@@ -132,9 +132,10 @@ class MujocoSimulator:
         return out
 
     def _parts(self, group: _Group, candidates: int) -> list[slice]:
-        """The candidates in parts of one batch each, at least one part per thread."""
+        """The candidates in parts of one batch each, equally many parts for every thread."""
         most = max(1, SIMULATIONS // len(group.setups))
-        parts = min(candidates, max(self.threads, -(-candidates // most)))
+        each = -(-candidates // (most * self.threads))
+        parts = min(candidates, each * self.threads)
         edges = np.linspace(0, candidates, parts + 1).astype(int)
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 

@@ -104,29 +104,49 @@ class Servos:
             damping *= on
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
-        viscous = self.viscous[: len(damping)]
-        brake = np.zeros_like(torque)
-        if self.law.steady or still:
-            share = np.zeros_like(torque)
-            if not still:
-                share = implicit_share(
-                    damping + viscous, self.scene.inertia[: len(damping)], self.scene.timestep
-                )
-            torque -= (1 - share) * (damping * sensed[1])
-            damping *= share
-            brake = (1 - share) * (viscous * sensed[1])
-            viscous = share * viscous
         if self.flowing:
-            now = link[1]
-            before = now if step == 0 or self._before is None else self._before[: len(now)]
-            self._before = now.copy()
-            flow = Flow(time, *link, 2 * now - before, bias, torque, damping, brake, viscous)
-            for term in self.flowing:
-                term.flow(flow)
-            torque, damping, brake, viscous = flow.torque, flow.damping, flow.brake, flow.viscous
-        torque -= brake
-        damping += viscous
+            return self._through_gears(step, link, sensed[1], bias, (torque, damping), still)
+        damping += self.viscous[: len(damping)]
+        implicit = self._implicit(damping, still)
+        if implicit is not None:
+            torque -= (1 - implicit) * (damping * sensed[1])
+            damping *= implicit
         return torque, damping
+
+    def _implicit(self, damping: Array, still: bool) -> Array | None:
+        """Share of a damping that the engine takes implicitly; None where it takes all of it."""
+        if still:
+            return np.zeros_like(damping)
+        if not self.law.steady:
+            return None
+        return implicit_share(damping, self.scene.inertia[: len(damping)], self.scene.timestep)
+
+    def _through_gears(
+        self,
+        step: int,
+        link: tuple[Array, Array],
+        sensed: Array,
+        bias: Array | None,
+        driven: tuple[Array, Array],
+        still: bool,
+    ) -> tuple[Array, Array]:
+        """What of the torque and damping of a servo reaches the links; see `torque`."""
+        torque, damping = driven
+        viscous, brake = self.viscous[: len(damping)], np.zeros_like(torque)
+        share = self._implicit(damping + viscous, still)
+        if share is not None:
+            torque -= (1 - share) * (damping * sensed)
+            damping *= share
+            brake = (1 - share) * (viscous * sensed)
+            viscous = share * viscous
+        now = link[1]
+        before = now if step == 0 or self._before is None else self._before[: len(now)]
+        self._before = now.copy()
+        time = step * self.scene.timestep
+        flow = Flow(time, *link, 2 * now - before, bias, torque, damping, brake, viscous)
+        for term in self.flowing:
+            term.flow(flow)
+        return flow.torque - flow.brake, flow.damping + flow.viscous
 
     def _target(self, step: int, running: int, time: float) -> Target:
         n = running * self.candidates
