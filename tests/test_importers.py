@@ -276,7 +276,7 @@ def test_refuses_unknown_formats_absent_paths_and_equal_ids(tmp_path: Path) -> N
         ("darwin-hardware", "darwin_op2_hardware", "darwin_op2", 19),
         ("bam", "servo_sts3032", "servo_bench", 48),
         ("emps", "emps", "emps", 1),
-        ("sage", "so101", None, 5),
+        ("sage", "so101", "so101", 5),
     ],
 )
 def test_the_real_logs_become_recordings_of_the_contract(

@@ -231,3 +231,35 @@ def test_the_emps_axis_is_a_mass_that_gravity_does_not_move() -> None:
     assert nominal["tau_max/axis"] == pytest.approx(35.15065 * 10, rel=1e-3)
     assert nominal["kd/axis"] == pytest.approx(35.15065 * 243.45, rel=1e-4)
     assert nominal["kp/axis"] == pytest.approx(nominal["kd/axis"] * 160.18, rel=1e-4)
+
+
+def test_the_so101_weighs_and_hangs_as_its_public_model() -> None:
+    """Masses and lever arms of so101_new_calib.xml, with the jaw half open.
+
+    At zero the upper arm stands and the rest lies straight ahead: gravity pulls all three down, and
+    down is positive.
+    """
+    robot = RobotDescription.load("so101")
+    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.body_mass.sum() == pytest.approx(0.147 + 0.100006 + 0.103 + 0.104 + 0.079 + 0.099)
+    expected = [0.0, 0.537692, 0.451762, 0.116148, -0.000087]
+    np.testing.assert_allclose(-data.qfrc_bias, expected, atol=2e-6)
+    data.qpos[:] = [0.3, 0.5, -0.4, 0.7, 1.2]
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.body("held").xpos, [0.373338, -0.111305, 0.077346], atol=1e-5)
+    expected = [0.0, 0.685728, 0.417493, 0.082318, 0.003179]
+    np.testing.assert_allclose(-data.qfrc_bias, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("joint", ["Pitch", "Elbow", "Wrist_Pitch"])
+def test_positive_angles_lower_the_so101(joint: str) -> None:
+    robot = RobotDescription.load("so101")
+    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    before = data.body("held").xpos[2]
+    data.joint(joint).qpos[0] = 0.1
+    mujoco.mj_forward(model, data)
+    assert data.body("held").xpos[2] < before - 0.01

@@ -1,0 +1,58 @@
+"""Parts of recordings: a stretch of time, or fewer readings."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pup.errors import InputError
+from pup.recording import Recording
+
+FEWEST = 2
+"""Rows that a part must have."""
+
+
+def cut(recording: Recording, start: float, stop: float, id: str = "") -> Recording:
+    """A stretch of a recording; its time starts again at 0.
+
+    Where the stretch starts, its replay starts from rest, or from the speeds that were read: cut
+    where the robot stands still.
+
+    Args:
+      recording: the whole.
+      start: of the stretch, since the recording's first row, s.
+      stop: its end, s; a row at the end itself belongs to what follows.
+      id: of the part; the recording's with the start in it where none is given.
+
+    Raises:
+      InputError: the stretch holds fewer than two rows.
+    """
+    since = recording.time - recording.time[0]
+    kept = (since >= start) & (since < stop)
+    if kept.sum() < FEWEST:
+        raise InputError(
+            f"recording {recording.id!r}: {start:g} to {stop:g} s holds {kept.sum()} rows; "
+            f"it lasts {since[-1]:g} s"
+        )
+    return replace(
+        recording,
+        id=id or f"{recording.id}_{start:g}s",
+        time=recording.time[kept] - recording.time[kept][0],
+        target=recording.target[kept],
+        position=recording.position[kept],
+        extras={name: values[kept] for name, values in recording.extras.items()},
+        repeat_of=None,
+        notes=f"{recording.notes} From {start:g} to {stop:g} s.".strip(),
+    )
+
+
+def thinned(recording: Recording, every: int) -> Recording:
+    """A recording with one in so many readings of position; all commands stay.
+
+    Args:
+      recording: the whole.
+      every: keep the first reading, and each so many rows another.
+    """
+    position = recording.position.copy()
+    dropped = np.arange(len(position)) % every != 0
+    position[dropped] = np.nan
+    return replace(recording, position=position)

@@ -1,0 +1,50 @@
+"""Parts of recordings."""
+
+import numpy as np
+import pytest
+
+from pup.errors import InputError
+from pup.recording import Recording
+from pup.recording_cuts import cut, thinned
+
+WHOLE = Recording(
+    id="whole",
+    robot="servo_bench",
+    motion="step",
+    support="bench",
+    source="hardware",
+    joints=("servo",),
+    time=2.0 + 0.1 * np.arange(10),
+    target=np.arange(10.0)[:, None],
+    position=0.5 * np.arange(10.0)[:, None],
+    extras={"voltage": 6.0 + 0.1 * np.arange(10)},
+    setup={"kp": 8.0},
+    repeat_of="another",
+)
+
+
+def test_a_stretch_has_the_rows_between_its_ends() -> None:
+    part = cut(WHOLE, 0.25, 0.75)
+    assert part.id == "whole_0.25s"
+    assert part.time == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert part.target[:, 0].tolist() == [3, 4, 5, 6, 7]
+    assert part.position[:, 0].tolist() == [1.5, 2, 2.5, 3, 3.5]
+    assert part.extras["voltage"] == pytest.approx([6.3, 6.4, 6.5, 6.6, 6.7])
+    assert (part.setup, part.motion, part.repeat_of) == ({"kp": 8.0}, "step", None)
+
+
+def test_stretches_side_by_side_are_the_whole() -> None:
+    parts = [cut(WHOLE, start, stop, id=f"p{start}") for start, stop in ((0, 0.45), (0.45, 2))]
+    assert [part.id for part in parts] == ["p0", "p0.45"]
+    assert np.concatenate([p.target for p in parts]).tolist() == WHOLE.target.tolist()
+
+
+def test_a_stretch_without_rows_is_refused() -> None:
+    with pytest.raises(InputError, match=r"'whole': 5 to 6 s holds 0 rows; it lasts 0\.9 s"):
+        cut(WHOLE, 5, 6)
+
+
+def test_thinned_keeps_all_commands_and_some_readings() -> None:
+    thin = thinned(WHOLE, 4)
+    assert thin.target.tolist() == WHOLE.target.tolist()
+    assert np.flatnonzero(~np.isnan(thin.position[:, 0])).tolist() == [0, 4, 8]
