@@ -5,20 +5,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from pup.diagnosis.discover import Lack, Unexplained
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Trace, scores
 from pup.diagnosis.fitting import Fit, nominal_coordinate, term_coordinate
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
+from pup.diagnosis.impulses import WRENCH_NAMES
+from pup.diagnosis.lawfit import Law
+from pup.diagnosis.locate import MissingInput
 from pup.diagnosis.nominal import Certificate, Nominal, free_names
 from pup.diagnosis.regimes import Regime, Window
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Model, Round
+from pup.diagnosis.splits import Ratio, Split
 from pup.diagnosis.verdict import Alternative, Finding, Parameter, held_out
 from pup.physics.parameters import robot_space
 from pup.physics.terms import TERMS, Place
+from pup.physics.terms.learned import LearnedLaw, unit
 from pup.physics.terms.scale import Scale
 from pup.recording import Recording
-from pup.robot import RobotDescription
+from pup.robot import RobotDescription, TermSpec
 
 MOTIONS = ("step", "chirp", "hold")
 SIGMA = 0.002
@@ -45,6 +51,16 @@ def recordings(robot: RobotDescription, ticks: int, motions: Sequence[str]) -> l
         )
         for i, motion in enumerate(motions)
     ]
+
+
+def split(group: str, first: str, second: str, chance: float = 1e-9, **values: float) -> Split:
+    """Parameters of two halves, known to 5 %; simulations gain what their difference promises."""
+    ratios = tuple(
+        Ratio(name, value, value / 1.05, value * 1.05, float(np.log(value) / 0.03))
+        for name, value in values.items()
+    )
+    wald = float(sum(r.surprise**2 for r in ratios))
+    return Split(group, first, second, ratios, wald, chance, wald, wald)
 
 
 class Maker:
@@ -184,4 +200,74 @@ class Maker:
             absorbed_by={f"kd/{self.robot.joints[0].group}": 0.31},
             law="tau -= x",
             gain=100.0,
+        )
+
+    def located(self, strengths: Mapping[str, float]) -> MissingInput:
+        """Torques of some strength at some channels, with evidence in its proportion.
+
+        Each is strongest in the second recording, half a second before its end.
+        """
+        channels = (*self.robot.joint_names, *WRENCH_NAMES)
+        joints = len(self.robot.joints)
+        strength = np.array([strengths.get(name, 0.0) for name in channels])
+        time = [np.arange(0.0, r.time[-1], 0.04) for r in self.measured.recordings]
+        mean = [0.1 * strength * np.sin(3 * t)[:, None] for t in time]
+        mean[1][np.abs(time[1] - time[1][-1] + 0.5) < 0.1] = 2 * strength
+        deviation = [np.repeat(0.1 * strength[None], len(t), axis=0) for t in time]
+        return MissingInput(
+            channels,
+            ("N m",) * joints + ("N",) * 3 + ("N m",) * 3,
+            strength,
+            500 * strength,
+            1.0,
+            tuple(time),
+            tuple(mean),
+            tuple(deviation),
+            np.zeros(self.samples),
+        )
+
+    def beyond(self, base: Diagnosis, place: Place, law: Law | None) -> Diagnosis:
+        """That something is left which no effect explains, with a law for it or without."""
+        assert base.model is not None
+        first = self.measured.recordings[0].id
+        channel = 0
+        if place.kind == "joint":
+            channel = self.robot.joint_names.index(place.name)
+        missing = self.located({self.robot.joint_names[channel]: 0.2})
+        model, sizes = base.model, {}
+        if law is not None:
+            fit = law.started(model.fit, place)
+            fit.residual, fit.chi2 = model.fit.residual, model.fit.chi2 / 2
+            fit.jacobian = self.rng.normal(size=(self.samples, len(fit.at)))
+            model = replace(model, fit=fit)
+            sizes = dict(zip(law.features, law.coefficients, strict=True))
+        finding = Finding(
+            effect="unknown",
+            place=place,
+            regime="throughout",
+            when=(Window(first, 0.5, 1.5),),
+            parameters={n: Parameter(v, unit(n), v - 0.01, v + 0.01) for n, v in sizes.items()},
+            probability=0.97,
+            equivalents=(),
+            absorbed_by={},
+            law=str(law) if law else None,
+            gain=50.0,
+        )
+        promising = "tau += 0.031 N m s/rad v"
+        left = Unexplained(
+            finding,
+            missing,
+            (Lack(channel, 3.0, 12.0, 2.25, 8.0, 1.21), Lack(channel, 0.2, 1.0, None, 0.0, 0.0)),
+            (str(law), promising) if law else (promising,),
+            model,
+            (TermSpec(LearnedLaw.effect, place.kind, place.name, sizes),) if law else (),
+        )
+        return replace(
+            base,
+            verdict="mismatch",
+            findings=(*base.findings, finding),
+            held_out=held_out(self.measured, base.model, model, 0),
+            model=model,
+            missing=missing,
+            unexplained=left,
         )

@@ -140,18 +140,6 @@ def test_every_effect_is_in_words() -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_cause_out_of_the_library_is_told(backlash: Diagnosis, tmp_path: Path) -> None:
-    unknown = replace(
-        backlash.findings[0], effect="unknown", parameters={}, law=None, equivalents=()
-    )
-    shown = page(replace(backlash, findings=(unknown,)), tmp_path)
-    assert "Something that none of the known effects explains happens at the left knee." in (
-        shown.text
-    )
-    assert "In the simulator:" not in shown.text
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_report_of_a_mismatch(backlash: Diagnosis, tmp_path: Path) -> None:
     shown = page(
         backlash, tmp_path, {"command": "pup diagnose <x>", "next_recording": NEXT, "seed": 0}
@@ -274,13 +262,32 @@ def test_a_finding_that_was_not_added_is_told(backlash: Diagnosis, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_two_findings_are_listed(backlash: Diagnosis, tmp_path: Path) -> None:
+def test_one_effect_at_two_places_is_one_item(backlash: Diagnosis, tmp_path: Path) -> None:
     first = backlash.findings[0]
-    second = replace(first, place=Place("joint", "l_hip_yaw"), probability=0.5)
+    second = replace(first, place=Place("joint", "l_hip_yaw"))
     shown = page(replace(backlash, findings=(first, second)), tmp_path)
-    assert "The simulator lacks 2 effects." in shown.text
+    assert "The simulator lacks backlash at the left knee and left hip yaw." in shown.text
     assert "Your fit hid them in" in shown.text
     assert "The left hip yaw loses" in shown.text
+    assert shown.text.count("makes up for them by the damping kd of the hip (31 % too high)") == 1
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_several_effects_are_listed_with_their_numbers(backlash: Diagnosis, tmp_path: Path) -> None:
+    first = backlash.findings[0]
+    drags = [
+        replace(first, effect="quadratic_damping", place=Place("group", g), absorbed_by={})
+        for g in ("hip", "ankle")
+    ]
+    shown = page(replace(backlash, findings=(first, *drags)), tmp_path)
+    assert "The simulator lacks 2 effects." in shown.text
+    items = [
+        "1The left knee loses 0.92° at every load reversal: gear backlash.",
+        "23Quadratic damping at the hip and ankle joints: "
+        "a drag that grows with the square of the speed.",
+    ]
+    assert "".join(items) in shown.text
+    assert "Without it, the nominal fit makes up for it by the damping kd" in shown.text
 
 
 @pytest.mark.usefixtures("undrawn")

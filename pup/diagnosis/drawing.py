@@ -22,7 +22,7 @@ from pup.sysid.html import Drawing
 
 Array = NDArray[np.float64]
 
-MARKS = (BLUE, GREEN, PURPLE, "#56B4E9")
+MARKS = (BLUE, GREEN, PURPLE, "#56B4E9", INK, "#882255")
 """Colours of the findings, in their order; the misfit's colours are others."""
 VIEWS = {"from the front": (1, 2), "from the side": (0, 2), "from above": (0, 1)}
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])

@@ -28,6 +28,7 @@ from pup.sysid.overlays import DOTTED, LINE_WIDTH
 Array = NDArray[np.float64]
 
 BEFORE, AFTER = VERMILLION, BLUE
+COLOURS = {"nominal": BEFORE, "corrected": AFTER}
 """Colours of the nominal and of the corrected model, in every figure."""
 MAP = matplotlib.colormaps["YlOrBr"]
 SHARES = matplotlib.colormaps["Blues"]
@@ -81,7 +82,7 @@ def error_bars(
         axes.barh(at, values, 0.9 * thick, color=colour, label=label)
     if np.isfinite(noise):
         axes.axvline(1000 * noise, color=INK, linewidth=1, linestyle="--", label="noise alone")
-    _rows(axes, names)
+    name_rows(axes, names)
     axes.set_xlim(0, 1.06 * max(1000 * max(max(p) for p in pairs), 1000 * np.nan_to_num(noise)))
     axes.set_xlabel(f"root mean square error on motions left out [{unit}]")
     axes.grid(axis="x")
@@ -181,7 +182,7 @@ def misfit_time(rows: Sequence[str], edges: Array, values: Array, norm: LogNorm)
         np.maximum(values, 1.0), cmap=MAP, norm=norm, aspect="auto", interpolation="nearest",
         extent=(float(edges[0]), float(edges[-1]), len(rows) - 0.5, -0.5),
     )  # fmt: skip
-    _rows(axes, rows, fontsize=7)
+    name_rows(axes, rows, fontsize=7)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlabel("time [s]", fontsize=8)
     axes.tick_params(axis="x", labelsize=8)
@@ -210,7 +211,7 @@ def ranking_bars(
         0.5 * min(float(surprise.min()), threshold), 1.6 * max(float(surprise.max()), threshold)
     )
     axes.xaxis.set_major_formatter("{x:,.0f}")
-    _rows(axes, names)
+    name_rows(axes, names)
     axes.set_xlabel("surprise: promised drop of chi-squared")
     axes.grid(axis="x")
     return as_svg(figure)
@@ -225,7 +226,7 @@ def gains(names: Sequence[str], inside: Array, outside: Array) -> Drawing:
     axes.plot(inside, at, "o", color=AMBER, label="on what it was fitted to")
     axes.plot(outside, at, "D", color=BLUE, markersize=5, label="on motions left out")
     axes.axvline(0, color=SOFT, linewidth=0.8)
-    _rows(axes, names)
+    name_rows(axes, names)
     largest = max(float(inside.max()), float(outside.max()), 1e-9)
     least = max(float(outside.min()), -largest)
     axes.set_xlim(min(least, 0.0) - 0.04 * largest, 1.06 * largest)
@@ -319,7 +320,8 @@ def _short(values: Array) -> NDArray[np.str_]:
     return np.array([[f"{v:.1f}" if v < 9.95 else f"{v:.0f}" for v in row] for row in values])
 
 
-def _rows(axes: Any, names: Sequence[str], fontsize: float = 8.5) -> None:
+def name_rows(axes: Any, names: Sequence[str], fontsize: float = 8.5) -> None:
+    """One row for each name, the first on top."""
     axes.set_yticks(range(len(names)), names, fontsize=fontsize)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)

@@ -1,5 +1,7 @@
 """What each effect is, in an equation and in plain words."""
 
+NAMELESS = "unknown"
+"""The effect of a finding that the library has no name for."""
 EQUATIONS = {
     "coulomb_friction": "tau -= f_c sgn(qdot), at rest up to f_c",
     "stribeck_friction": "tau -= (f_c + f_r exp(-|qdot|/v_s)) sgn(qdot)",
@@ -75,5 +77,5 @@ WORDS = {
     "imu_misalignment": "an IMU that is mounted askew",
     "imu_delay": "an IMU whose angles are old",
     "external_force": "a force from outside, such as a tether",
-    "unknown": "something that none of the known effects explains",
+    NAMELESS: "something that no known effect explains",
 }

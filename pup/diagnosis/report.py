@@ -1,22 +1,32 @@
 """The report of a diagnosis: one page that needs nothing but itself."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pup.diagnosis import report_errors, report_evidence, report_fit, summary
-from pup.diagnosis.drawing import MARKS, draw_robot
+from pup.diagnosis import (
+    report_errors,
+    report_evidence,
+    report_findings,
+    report_fit,
+    report_missing,
+    report_splits,
+    report_unknown,
+    summary,
+)
+from pup.diagnosis.drawing import draw_robot
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.laws import WORDS
-from pup.diagnosis.sentences import sentence
-from pup.diagnosis.verdict import Finding
-from pup.diagnosis.wording import Speech, capital, minus, percent, quantity_words
+from pup.diagnosis.laws import NAMELESS, WORDS
+from pup.diagnosis.report_findings import badge, otherwise
+from pup.diagnosis.sentences import items
+from pup.diagnosis.wording import Speech, capital, minus, percent
 from pup.files import write_atomic
 from pup.sysid.accuracy import JointUnits
 from pup.sysid.figures import drawing_style
-from pup.sysid.html import Column, Html, figure, page, table, tag
+from pup.sysid.html import Column, Html, figure, join, page, table, tag
 from pup.sysid.wording import counted, flattened, listed, recordings_words
 
 SURE = 0.7
@@ -24,8 +34,8 @@ SURE = 0.7
 LEFT = 1.3
 """An error of more than so many times the noise is too much for noise."""
 NEXT = "next_recording"
-BADGE = "color: #fff; border-radius: 1em; padding: 0 0.5em; margin-right: 0.5em;"
-"""Looks of a finding's number."""
+LIST = "list-style: none; padding-left: 0; font-size: 1.15rem"
+"""Looks of the list of what is missing."""
 
 
 def write_report(diagnosis: Diagnosis, path: Path, provenance: Mapping[str, Any]) -> None:
@@ -49,17 +59,19 @@ class _Report:
         self.speech = Speech(diagnosis.robot, units)
         self.provenance = {k: v for k, v in provenance.items() if k != NEXT}
         self.next: Mapping[str, Any] = provenance.get(NEXT) or {}
-        self.sentences = [sentence(diagnosis, f, self.speech) for f in diagnosis.findings]
+        self.items = items(diagnosis, self.speech)
 
     def content(self) -> Iterator[Html]:
         """The page's body; a section with nothing to say is left out."""
         case = (self.diagnosis, self.speech)
-        sections: dict[str, Callable[[], Iterator[Html]]] = {
-            "What is missing": self.missing,
-            "Where": self.where,
-            "Before and after" if case[0].findings else "Errors on motions left out": lambda: (
-                report_errors.before_and_after(*case)
-            ),
+        mended = summary.corrected(self.diagnosis)
+        errors = "Before and after" if mended else "Errors on motions left out"
+        sections: dict[str, Callable[[], Iterable[Html]]] = {
+            "What is missing": lambda: report_findings.missing(*case),
+            "Where": lambda: chain(self.where(), report_missing.torques(*case)),
+            "Parameters that differ between halves of the data": lambda: report_splits.gaps(*case),
+            "What no known effect explains": lambda: report_unknown.left(*case),
+            errors: lambda: report_errors.before_and_after(*case),
             "When the model is off": lambda: report_errors.maps(*case),
             "Evidence": lambda: report_evidence.evidence(*case),
             "What could hide": lambda: report_evidence.hiding(*case),
@@ -82,9 +94,9 @@ class _Report:
         count = recordings_words(diagnosis.measured.recordings)
         yield tag("p", f"Diagnosis of {diagnosis.robot.name}, from {count}", class_="lead")
         yield tag("h1", self.title())
-        if len(self.sentences) > 1:
-            items = (tag("li", text) for text in self.sentences)
-            yield tag("ol", *items, style="font-size: 1.15rem")
+        if len(self.items) > 1:
+            lines = ([*map(badge, item.numbers), item.text] for item in self.items)
+            yield tag("ul", *(tag("li", join(line)) for line in lines), style=LIST)
         for words in {"mismatch": self.hid, "none": self.nothing, "undetermined": self.unclear}[
             diagnosis.verdict
         ]():
@@ -93,7 +105,7 @@ class _Report:
 
     def title(self) -> str:
         """The verdict in one sentence."""
-        diagnosis, findings = self.diagnosis, self.diagnosis.findings
+        diagnosis = self.diagnosis
         if diagnosis.verdict == "undetermined":
             return "These recordings cannot tell whether anything is missing."
         if diagnosis.verdict == "none":
@@ -104,10 +116,18 @@ class _Report:
                 )
             least = self.error(summary.smallest_material(diagnosis))
             return f"Nothing material is missing from the simulator beyond {least}."
-        if len(findings) > 1:
-            return f"The simulator lacks {len(findings)} effects."
-        unsure = "Most likely: " if findings and findings[0].probability < SURE else ""
-        return unsure + " ".join(self.sentences)
+        unsure = min(finding.probability for finding in diagnosis.findings) < SURE
+        if len(self.items) == 1:
+            return ("Most likely: " if unsure else "") + self.single()
+        known = [item for item in self.items if item.effect != NAMELESS]
+        lacks = known[0].name if len(known) == 1 else f"{len(known)} effects"
+        beyond = f", and {WORDS[NAMELESS]}" if len(known) < len(self.items) else ""
+        return f"The simulator lacks {lacks}{beyond}."
+
+    def single(self) -> str:
+        """The one effect that is missing, at one place or at several."""
+        item = self.items[0]
+        return item.text if len(item.numbers) == 1 else f"The simulator lacks {item.name}."
 
     def error(self, value: float) -> str:
         """An error as `2.1 mrad (0.12°)`."""
@@ -121,8 +141,12 @@ class _Report:
     def hid(self) -> Iterator[str]:
         """Where a mismatch hid and what naming it is worth."""
         diagnosis = self.diagnosis
-        it = "it" if len(diagnosis.findings) == 1 else "them"
-        shifts = self.speech.shifts(diagnosis.findings[0].absorbed_by) if diagnosis.findings else ""
+        if not summary.corrected(diagnosis):
+            yield self.unmended()
+            return
+        added = [f for f in diagnosis.findings if f.effect != NAMELESS or f.law]
+        it = "it" if len(added) == 1 else "them"
+        shifts = self.speech.shifts(added[0].absorbed_by)
         hidden = f"Your fit hid {it} in the {shifts}. " if shifts else ""
         if diagnosis.held_out is None:
             yield hidden
@@ -139,6 +163,15 @@ class _Report:
                 f"What is left is still {self.left():.1f} times the noise: more is missing than "
                 "the effects named here."
             )
+
+    def unmended(self) -> str:
+        """What it means that a cause was found but neither its name nor its law."""
+        tried = counted(len({t.hypothesis.key for t in self.diagnosis.found}), "combination")
+        return (
+            f"None of {tried} of effect and place is its cause, and no law for a torque predicts "
+            "motions that were left out of the fit. So nothing was added to the corrected robot: "
+            f"it is the simulator refitted, off by {self.left():.1f} times the noise."
+        )
 
     def nothing(self) -> Iterator[str]:
         """What it means that nothing is missing."""
@@ -186,7 +219,8 @@ class _Report:
         diagnosis, units = self.diagnosis, self.speech.units
         held = diagnosis.held_out
         if held is not None:
-            after = f" → {1000 * held.after:.1f}" if diagnosis.findings else ""
+            mended = summary.corrected(diagnosis)
+            after = f" → {1000 * held.after:.1f}" if mended else ""
             yield (
                 "Error on motions left out",
                 f"{1000 * held.before:.1f}{after} {units.small}",
@@ -200,63 +234,12 @@ class _Report:
         )
         if np.isfinite(self.left()):
             yield "What is left", f"{self.left():.2f}", "times the noise; 1: nothing but noise"
-        if diagnosis.findings:
-            least = min(f.probability for f in diagnosis.findings)
-            of = "" if len(diagnosis.findings) == 1 else "of the least sure finding"
-            yield "Probability", percent(least), of or "that effect and place are right"
+        named = [f.probability for f in diagnosis.findings if f.effect != NAMELESS]
+        if named:
+            of = "" if len(named) == 1 else "of the least sure finding"
+            yield "Probability", percent(min(named)), of or "that effect and place are right"
         if not diagnosis.nominal.certificate.holds:
             yield "Nominal fit", "not converged", ""
-
-    def missing(self) -> Iterator[Html]:
-        """Each finding with its size, its law and what else it could be."""
-        for number, finding in enumerate(self.diagnosis.findings, start=1):
-            badge = tag(
-                "span",
-                str(number),
-                style=f"{BADGE} background: {MARKS[(number - 1) % len(MARKS)]}",
-            )
-            yield tag("h3", badge, self.speech.heading(finding.effect, finding.place))
-            if len(self.diagnosis.findings) > 1:
-                yield tag("p", self.sentences[number - 1])
-            yield tag("p", *self.detail(finding))
-            rows = self.sizes(finding)
-            if rows:
-                columns = [Column("Quantity"), Column("Value", "number")]
-                columns.append(Column("90 % interval", "number"))
-                yield table("Sizes as fitted", columns, rows)
-            yield tag("p", self.otherwise(finding))
-
-    def detail(self, finding: Finding) -> Iterator[str]:
-        """When a finding shows, and its law."""
-        if finding.regime == "throughout":
-            yield "It shows throughout the recordings. "
-        else:
-            yield f"It shows most {finding.regime}. "
-        if finding.law:
-            yield "In the simulator: "
-            yield tag("code", finding.law)
-            yield "."
-
-    def sizes(self, finding: Finding) -> list[tuple[str, str, str]]:
-        """Rows of a finding's quantities."""
-        rows = []
-        for name, p in finding.parameters.items():
-            value, low, high = (
-                self.speech.quantity(v, p.unit, 3) for v in (p.value, p.lower, p.upper)
-            )
-            rows.append((quantity_words(name), value, f"{low} to {high}"))
-        return rows
-
-    def otherwise(self, finding: Finding) -> str:
-        """What else a finding could be."""
-        rest = [
-            f"{self.speech.words(a.effect, a.place)} ({percent(a.probability)})"
-            for a in finding.equivalents
-        ]
-        own = f"Probability {percent(finding.probability)}."
-        if not rest:
-            return f"{own} No other effect of the library explains these motions nearly as well."
-        return f"{own} These motions would also fit {listed(rest)}."
 
     def where(self) -> Iterator[Html]:
         """The robot with the places in colour."""
@@ -312,7 +295,7 @@ class _Report:
         for finding in self.diagnosis.findings:
             if finding.equivalents:
                 named = self.speech.words(finding.effect, finding.place)
-                yield tag("p", f"{capital(named)}: {self.otherwise(finding)}")
+                yield tag("p", f"{capital(named)}: {otherwise(finding, self.speech)}")
 
     def came_about(self) -> Iterator[Html]:
         """How the result came about."""

@@ -7,8 +7,7 @@ import numpy as np
 from pup.diagnosis import summary
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures import (
-    AFTER,
-    BEFORE,
+    COLOURS,
     Traced,
     error_bars,
     misfit_map,
@@ -35,7 +34,7 @@ def before_and_after(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     held = diagnosis.held_out
     if held is None or diagnosis.model is None:
         return
-    corrected = bool(diagnosis.findings)
+    corrected = summary.corrected(diagnosis)
     yield tag(
         "p",
         "Every error here is of a prediction: motions of one type were left out, the model fitted "
@@ -84,9 +83,9 @@ def _windows(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
         ]
     else:
         groups = [("Windows with the largest errors", summary.worst(diagnosis, PANELS // 2))]
-    key = [("command", SOFT, "solid"), ("measured", INK, "dotted"), ("nominal", BEFORE, "dashed")]
-    if count:
-        key.append(("corrected", AFTER, "solid"))
+    key = [("command", SOFT, "solid"), ("measured", INK, "dotted")]
+    dashes = {"nominal": "dashed", "corrected": "solid"}
+    key += [(name, COLOURS[name], dashes[name]) for name in summary.models(diagnosis)]
     shown = False
     for title, views in groups:
         if not views:
@@ -113,7 +112,6 @@ def _windows(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
 
 def _panel(diagnosis: Diagnosis, speech: Speech, view: View) -> Html:
     """One window, drawn."""
-    assert diagnosis.model is not None
     measured = diagnosis.measured
     number = [r.id for r in measured.recordings].index(view.window.recording)
     recording = measured.recordings[number]
@@ -124,9 +122,7 @@ def _panel(diagnosis: Diagnosis, speech: Speech, view: View) -> Html:
     turns = tilts or speech.units.turning
     factor = float(np.degrees(1)) if turns else 1000.0
     unit, small = ("°", "mrad") if turns else (speech.units.small, speech.units.small)
-    models = {("nominal", BEFORE): summary.nominal_model(diagnosis)}
-    if diagnosis.findings:
-        models["corrected", AFTER] = diagnosis.model
+    models = summary.models(diagnosis)
     command = None
     if not tilts:
         elapsed = recording.time - recording.time[0]
@@ -137,7 +133,7 @@ def _panel(diagnosis: Diagnosis, speech: Speech, view: View) -> Html:
         Traced(
             time=measured.time[chosen],
             measured=factor * measured.values[chosen],
-            models={k: factor * m.predicted[chosen] for k, m in models.items()},
+            models={(n, COLOURS[n]): factor * m.predicted[chosen] for n, m in models.items()},
             command=command,
             noise=1000 * float(diagnosis.noise.sigma[view.channel]),
             span=(view.window.start, view.window.end),
@@ -148,7 +144,7 @@ def _panel(diagnosis: Diagnosis, speech: Speech, view: View) -> Html:
     )
     errors = {
         label: float(np.sqrt(np.mean((measured.values - m.predicted)[chosen] ** 2)))
-        for (label, _), m in models.items()
+        for label, m in models.items()
     }
     told = " → ".join(f"{thousandths(e)}" for e in errors.values())
     where = f"{speech.channels()[view.channel]} in {recording.id}"
@@ -185,8 +181,9 @@ def maps(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
             f"Nominal model. {takeaway}",
         )
     ]
-    if diagnosis.model is not None and diagnosis.findings:
-        _, after = summary.by_regime(diagnosis, diagnosis.model.fit)
+    corrected = summary.models(diagnosis).get("corrected")
+    if corrected is not None:
+        _, after = summary.by_regime(diagnosis, corrected.fit)
         panels.append(
             figure(
                 misfit_map(names, regimes, after, norm),

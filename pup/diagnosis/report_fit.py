@@ -8,7 +8,7 @@ from pup.diagnosis import summary
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.nominal import SELF
-from pup.diagnosis.wording import Speech, change, digits, parameter_words
+from pup.diagnosis.wording import Speech, capital, change, digits, parameter_words
 from pup.physics.terms import split_column
 from pup.sysid.html import Column, Html, table, tag
 from pup.sysid.wording import counted, setup, thousandths
@@ -65,8 +65,8 @@ def _parameters(diagnosis: Diagnosis, speech: Speech) -> Html:
     """Nominal parameters in the robot's file, after the nominal fit, and corrected."""
     robot = {p.name: p for p in diagnosis.robot.parameters}
     before = _intervals(diagnosis.nominal.fit)
-    corrected = diagnosis.model.fit if diagnosis.model and diagnosis.findings else None
-    after = _intervals(corrected) if corrected else {}
+    corrected = summary.models(diagnosis).get("corrected")
+    after = _intervals(corrected.fit) if corrected else {}
     columns = [Column("Parameter"), Column("Unit", "words"), Column("Robot's file", "number")]
     columns.append(Column("Nominal fit", "number"))
     if corrected:
@@ -104,16 +104,10 @@ def _recordings(diagnosis: Diagnosis, speech: Speech) -> Html:
     """What was recorded, and how well each is predicted when its type is left out."""
     measured = diagnosis.measured
     joints = measured.channel < len(diagnosis.robot.joints)
-    models = []
-    if diagnosis.model is not None:
-        models.append(
-            ("Nominal", diagnosis.rounds[0].before if diagnosis.rounds else diagnosis.model)
-        )
-    if diagnosis.findings and diagnosis.model is not None:
-        models.append(("Corrected", diagnosis.model))
+    models = summary.models(diagnosis)
     columns = [Column("Recording", "long"), Column("Motion"), Column("Support")]
     columns += [Column("Duration [s]", "number"), Column("Readings", "number")]
-    columns += [Column(f"{label} [{speech.units.small}]", "number") for label, _ in models]
+    columns += [Column(f"{capital(name)} [{speech.units.small}]", "number") for name in models]
     knobs = any(r.setup for r in measured.recordings)
     columns += [Column("Setup", "words")] if knobs else []
     rows = []
@@ -121,7 +115,7 @@ def _recordings(diagnosis: Diagnosis, speech: Speech) -> Html:
         inside = joints & (measured.recording == number)
         row = [recording.id, recording.motion, recording.support]
         row += [f"{np.ptp(recording.time):.1f}", f"{int((measured.recording == number).sum())}"]
-        for _, model in models:
+        for model in models.values():
             error = (measured.values - model.predicted)[inside]
             row.append(thousandths(float(np.sqrt(np.mean(error**2)))) if inside.any() else "none")
         rows.append([*row, setup(recording)] if knobs else row)

@@ -1,14 +1,14 @@
 """Each finding as a sentence that a mechanic understands, with its size in the units of a bench."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.laws import WORDS
+from pup.diagnosis.laws import NAMELESS, WORDS
 from pup.diagnosis.verdict import Finding
-from pup.diagnosis.wording import Speech, capital, digits, minus, percent
+from pup.diagnosis.wording import Speech, capital, digits, effect_words, minus, percent
 from pup.physics.terms import TERMS, column
 from pup.sysid.wording import listed
 
@@ -60,11 +60,60 @@ class Facts:
         return float(np.linalg.norm(list(self.size.values())))
 
 
+@dataclass(frozen=True)
+class Item:
+    """All findings of one effect, as one line.
+
+    Attributes:
+      effect: its name.
+      numbers: of the findings among all, from 1.
+      name: effect and places, as they stand behind "the simulator lacks".
+      text: a sentence.
+    """
+
+    effect: str
+    numbers: tuple[int, ...]
+    name: str
+    text: str
+
+
+def items(diagnosis: Diagnosis, speech: Speech) -> list[Item]:
+    """The findings, with those of one effect at several places as one."""
+    together: dict[str, list[tuple[int, Finding]]] = {}
+    for number, finding in enumerate(diagnosis.findings, start=1):
+        together.setdefault(finding.effect, []).append((number, finding))
+    return [_item(diagnosis, speech, effect, told) for effect, told in together.items()]
+
+
+def _item(
+    diagnosis: Diagnosis, speech: Speech, effect: str, told: Sequence[tuple[int, Finding]]
+) -> Item:
+    name = speech.lack(effect, [finding.place for _, finding in told])
+    meaning = WORDS[effect]
+    # Some names are as clear as what they mean: gear backlash is backlash.
+    text = name if effect_words(effect) in meaning else f"{name}: {meaning}"
+    text = f"{capital(text)}."
+    if len(told) == 1:
+        text = sentence(diagnosis, told[0][1], speech)
+    return Item(effect, tuple(number for number, _ in told), name, text)
+
+
 def sentence(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:
     """What a finding says."""
-    if finding.effect not in _TEMPLATES:
-        return f"{capital(WORDS['unknown'])} happens at {speech.place(finding.place)}."
+    if finding.effect == NAMELESS:
+        return _nameless(finding, speech)
     return minus(capital(_TEMPLATES[finding.effect](_facts(diagnosis, finding, speech))))
+
+
+def _nameless(finding: Finding, speech: Speech) -> str:
+    """Where something happens that has no name, and what it acts like if that is known."""
+    place = finding.place
+    spread = {"robot": "at most joints of the robot", "sensor": "in the readings of the IMU"}
+    where = spread.get(place.kind, f"at {speech.place(place)}")
+    like = ""
+    if finding.law:
+        like = f"; it acts like the torque {minus(finding.law.removeprefix('tau += '))}"
+    return f"{capital(WORDS[NAMELESS])} happens {where}{like}."
 
 
 def _facts(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> Facts:

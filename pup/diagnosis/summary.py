@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Score, Trace, overlap, scores
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.regimes import Window, windows
 from pup.diagnosis.selection import KEPT, MATERIAL, Model, Round
 from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
+from pup.physics.terms import Place
 
 Array = NDArray[np.float64]
 
@@ -132,10 +134,28 @@ def smallest_material(diagnosis: Diagnosis) -> float:
     return sigma * max(MATERIAL, float(np.sqrt(diagnosis.enough / len(diagnosis.measured.values))))
 
 
-def nominal_model(diagnosis: Diagnosis) -> Model:
-    """The model before anything was added."""
-    assert diagnosis.model is not None
-    return diagnosis.rounds[0].before if diagnosis.rounds else diagnosis.model
+def corrected(diagnosis: Diagnosis) -> bool:
+    """Whether anything was added to the nominal model: a cause without a law adds nothing."""
+    model, left = diagnosis.model, diagnosis.unexplained
+    return model is not None and bool(model.hypotheses or (left is not None and left.terms))
+
+
+def models(diagnosis: Diagnosis) -> dict[str, Model]:
+    """The `nominal` and the `corrected` model, as far as there are such."""
+    told: dict[str, Model] = {}
+    if diagnosis.model is None:
+        return told
+    if diagnosis.rounds:
+        told["nominal"] = diagnosis.rounds[0].before
+    told["corrected" if corrected(diagnosis) else "nominal"] = diagnosis.model
+    return told
+
+
+def limits(diagnosis: Diagnosis) -> Array:
+    """Largest torque of each joint's servo by the nominal fit, N m; NaN where none is known."""
+    robot = diagnosis.robot
+    known = {p.name: p.nominal for p in robot.parameters} | diagnosis.nominal.fit.values
+    return np.array([known.get(f"tau_max/{joint.group}", np.nan) for joint in robot.joints])
 
 
 def joint_noise(diagnosis: Diagnosis) -> float:
@@ -249,25 +269,28 @@ def hardest(diagnosis: Diagnosis) -> list[tuple[Trace, float]]:
 
 def telling(diagnosis: Diagnosis, finding: Finding, most: int) -> list[View]:
     """The windows that show a finding best."""
-    assert diagnosis.model is not None
-    measured = diagnosis.measured
-    before, after = nominal_model(diagnosis).predicted, diagnosis.model.predicted
-    gain = (measured.values - before) ** 2 - (measured.values - after) ** 2
-    place = finding.place
-    if place.kind == "joint":
-        allowed = [diagnosis.robot.joint_names.index(place.name)]
-    else:
-        joints = diagnosis.robot.joints
-        members = [
-            i for i, j in enumerate(joints) if place.kind == "group" and j.group == place.name
-        ]
-        allowed = members or channels(diagnosis)
-    views = _views(diagnosis, finding.when, gain / _variance(diagnosis), allowed)
+    both = models(diagnosis)
+    allowed = _members(diagnosis, finding.place)
+    nowhere = finding.effect == NAMELESS and finding.law is None
+    if len(both) < 2 or nowhere:  # what stands in no model leaves only its errors to be shown
+        errors = _squares(diagnosis, list(both.values())[-1])
+        return _views(diagnosis, finding.when, errors, allowed)[:most]
+    gain = _squares(diagnosis, both["nominal"]) - _squares(diagnosis, both["corrected"])
+    views = _views(diagnosis, finding.when, gain, allowed)
     better: dict[object, View] = {}
     for view in views:
         if _drop(diagnosis, view) > BETTER:  # of repeats, one will do
             better.setdefault((_first(diagnosis, view.window.recording), view.start), view)
     return (list(better.values()) or views[:1])[:most]
+
+
+def _members(diagnosis: Diagnosis, place: Place) -> list[int]:
+    """The joints of a place, or all channels where it has none of its own."""
+    kinds = {"joint": "name", "group": "group"}
+    if place.kind not in kinds:
+        return channels(diagnosis)
+    of = [getattr(joint, kinds[place.kind]) for joint in diagnosis.robot.joints]
+    return [i for i, name in enumerate(of) if name == place.name]
 
 
 def _first(diagnosis: Diagnosis, name: str) -> str:
@@ -277,16 +300,15 @@ def _first(diagnosis: Diagnosis, name: str) -> str:
 
 def _drop(diagnosis: Diagnosis, view: View) -> float:
     """By which share the corrected model's error in a view is smaller."""
-    assert diagnosis.model is not None
-    measured = diagnosis.measured
+    measured, both = diagnosis.measured, models(diagnosis)
     inside = (measured.time >= view.start) & (measured.time <= view.end)
     inside &= measured.channel == view.channel
     inside &= np.array([r.id == view.window.recording for r in measured.recordings])[
         measured.recording
     ]
     before, after = (
-        float(np.linalg.norm((measured.values - m.predicted)[inside]))
-        for m in (nominal_model(diagnosis), diagnosis.model)
+        float(np.linalg.norm((measured.values - both[name].predicted)[inside]))
+        for name in ("nominal", "corrected")
     )
     return 1 - after / max(before, 1e-300)
 
@@ -294,13 +316,16 @@ def _drop(diagnosis: Diagnosis, view: View) -> float:
 def worst(diagnosis: Diagnosis, most: int) -> list[View]:
     """The windows with the largest errors of the model."""
     assert diagnosis.model is not None
-    errors = (diagnosis.measured.values - diagnosis.model.predicted) ** 2 / _variance(diagnosis)
+    errors = _squares(diagnosis, diagnosis.model)
     found = windows(diagnosis.measured, errors, most)
     return _views(diagnosis, found, errors, channels(diagnosis))
 
 
-def _variance(diagnosis: Diagnosis) -> Array:
-    return np.asarray(diagnosis.noise.sigma[diagnosis.measured.channel] ** 2)
+def _squares(diagnosis: Diagnosis, model: Model) -> Array:
+    """Squared errors on motions left out, in units of the noise's variance."""
+    measured = diagnosis.measured
+    errors = (measured.values - model.predicted) / diagnosis.noise.sigma[measured.channel]
+    return np.asarray(errors**2)
 
 
 def _views(

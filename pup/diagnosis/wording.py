@@ -1,7 +1,7 @@
 """What the report of a diagnosis calls places, parameters and numbers."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,6 +140,20 @@ class Speech:
             link = " link" if place.name.endswith("_link") else ""
             return f"the {spoken(place.name)}{link}"
         return f"the {spoken(place.name)}"
+
+    def places(self, places: Sequence[Place]) -> str:
+        """Several places of one effect: groups share their noun, all others their article."""
+        if all(place.kind == "group" for place in places):
+            return f"the {listed([spoken(place.name) for place in places])} joints"
+        names = [self.place(place) for place in places]
+        if all(name.startswith("the ") for name in names):
+            return f"the {listed([name.removeprefix('the ') for name in names])}"
+        return listed(names)
+
+    def lack(self, effect: str, places: Sequence[Place]) -> str:
+        """What a simulator lacks: an effect by its name, at its places."""
+        at = "on" if places[0].kind in ("bus", "robot") else "at"
+        return f"{effect_words(effect)} {at} {self.places(places)}"
 
     def short(self, effect: str, place: Place) -> str:
         """An effect at a place, for a label."""
