@@ -251,7 +251,7 @@ class Maker:
             equivalents=(),
             absorbed_by={},
             law=str(law) if law else None,
-            gain=50.0,
+            gain=model.fit.chi2,  # a law halves chi-squared
         )
         promising = "tau += 0.031 N m s/rad v"
         left = Unexplained(

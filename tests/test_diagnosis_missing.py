@@ -205,6 +205,14 @@ def test_a_law_that_holds_is_told(leg: Maker, tmp_path: Path) -> None:
     assert "Corrected" in shown.table("Parameter")[0]
 
 
+def test_a_law_that_explains_little_is_not_said_to_describe_it(leg: Maker) -> None:
+    told = leg.beyond(leg.nothing(2.0), KNEE, LAW)
+    weak = replace(told.findings[0], gain=0.01 * told.findings[0].gain)
+    words = sentence(told, weak, speech(told))
+    assert words.startswith(f"{NAMELESS} at the left knee; the best law for it explains only 2")
+    assert "torque" not in words
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_known_and_nameless_causes_share_a_headline(
     backlash: Diagnosis, leg: Maker, tmp_path: Path

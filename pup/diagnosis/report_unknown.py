@@ -8,7 +8,8 @@ import numpy as np
 from pup.diagnosis.discover import Lack, Unexplained
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.report_missing import lacking
-from pup.diagnosis.wording import Speech
+from pup.diagnosis.summary import described
+from pup.diagnosis.wording import Speech, percent
 from pup.physics.terms import Place
 from pup.sysid.html import Column, Html, table, tag
 from pup.sysid.wording import listed
@@ -37,7 +38,7 @@ def left(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     beside = f"With {listed(known)} in the model" if known else "With no effect in the model"
     lacks = sorted(told.lacks, key=lambda one: -max(one.surprise, one.repeated_surprise))
     yield tag("p", f"{beside}, more than noise is left. {_worst(lacks, speech)}")
-    yield from _laws(told)
+    yield from _laws(told, described(diagnosis, told.finding))
     if lacks:
         yield _table(lacks[:BEST], speech)
     if known:  # else it is the torque that the nominal model lacks, told above
@@ -68,15 +69,16 @@ def _worst(lacks: Sequence[Lack], speech: Speech) -> str:
     return f"Clearest at the {where}: errors are {_root(1 + worst.excess)} times the noise{more}."
 
 
-def _laws(told: Unexplained) -> Iterator[Html]:
-    """The laws that were tried, with a key to their symbols."""
+def _laws(told: Unexplained, share: float) -> Iterator[Html]:
+    """The laws that were tried, with a key to their symbols; the first explains a share of it."""
     kept = bool(told.terms)
     yield tag("h3", "Laws for it")
     if not told.laws:
         yield tag("p", "No law of what a servo sees and does comes near to explaining it.")
         return
     verdict = (
-        "The first is in the corrected robot: it predicts motions that were left out of the fit."
+        "The first is in the corrected robot: it holds on motions that were left out of the fit, "
+        f"and explains {percent(share)} of what is more than noise."
         if kept
         else "None of them predicts motions that were left out of the fit, so none is in the "
         "corrected robot. They are hints."

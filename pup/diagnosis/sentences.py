@@ -7,12 +7,15 @@ import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS, WORDS
+from pup.diagnosis.summary import described
 from pup.diagnosis.verdict import Finding
 from pup.diagnosis.wording import Speech, capital, digits, effect_words, minus, percent
 from pup.physics.terms import TERMS, column
 from pup.sysid.wording import listed
 
 QUARTER = np.pi / 2
+MOSTLY = 0.5
+"""A law that explains a smaller share of something does not describe it."""
 
 
 @dataclass(frozen=True)
@@ -101,18 +104,21 @@ def _item(
 def sentence(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:
     """What a finding says."""
     if finding.effect == NAMELESS:
-        return _nameless(finding, speech)
+        return _nameless(diagnosis, finding, speech)
     return minus(capital(_TEMPLATES[finding.effect](_facts(diagnosis, finding, speech))))
 
 
-def _nameless(finding: Finding, speech: Speech) -> str:
+def _nameless(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:
     """Where something happens that has no name, and what it acts like if that is known."""
     place = finding.place
     spread = {"robot": "at most joints of the robot", "sensor": "in the readings of the IMU"}
     where = spread.get(place.kind, f"at {speech.place(place)}")
     like = ""
-    if finding.law:
-        like = f"; it acts like the torque {minus(finding.law.removeprefix('tau += '))}"
+    if finding.law:  # a law may hold and yet be next to nothing
+        share = described(diagnosis, finding)
+        like = f"; the best law for it explains only {percent(share)} of it"
+        if share > MOSTLY:
+            like = f"; it acts like the torque {minus(finding.law.removeprefix('tau += '))}"
     return f"{capital(WORDS[NAMELESS])} happens {where}{like}."
 
 
