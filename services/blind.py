@@ -1,12 +1,16 @@
-"""The blind jobs: make a sealed set of concealed cases, and score the verdicts on one."""
+"""The blind jobs: make a sealed set of concealed cases, diagnose it, and score the verdicts."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 from pup.blind.make import make_set
+from pup.blind.seal import read_set
+from pup.errors import InputError
 from pup.files import write_atomic, write_json
+from services import places
+from services.blind_journal import JOURNAL, SAME_SET, Journal, read_journal
+from services.progress import counted
 
 
 def make(options: argparse.Namespace) -> dict[str, Any]:
@@ -15,47 +19,74 @@ def make(options: argparse.Namespace) -> dict[str, Any]:
     Returns:
       The commitment.
     """
-    terminal = sys.stderr.isatty()
+    with counted("blind make") as tell:
+        return make_set(
+            dict(options.robot),
+            dict(options.nulls),
+            options.seed,
+            options.out,
+            options.key,
+            lambda id, done, total: tell(done, total),
+        )
 
-    def report(id: str, done: int, total: int) -> None:
-        line = f"blind make: {done}/{total} cases"
-        print(f"\r{line}" if terminal else line, file=sys.stderr, end="" if terminal else "\n")
 
-    commitment = make_set(
-        dict(options.robot), dict(options.nulls), options.seed, options.out, options.key, report
-    )
-    if terminal:
-        print(file=sys.stderr)
-    return commitment
+def run(options: argparse.Namespace) -> dict[str, Any]:
+    """Diagnose all cases of a set.
+
+    Returns:
+      How many cases there are, and the run's journal.
+    """
+    from services.blind_run import orders, run_cases
+
+    wanted, commitment = orders(options.set, options.out, options.limit)
+    journal = Journal(options.out, commitment)
+    if not all(order.done for order in wanted):
+        with places.cases(options) as (each, lanes), counted("blind run") as tell:
+            run_cases(wanted, journal, each, lanes, tell)
+    return {"cases": len(wanted), "out": str(options.out), **journal.document()}
 
 
 def score(options: argparse.Namespace) -> dict[str, Any]:
     """Score the verdicts on a set and write the table beside the scores.
 
     Returns:
-      The scores, with the table under `table`.
+      The scores, with the engine that diagnosed, and the table under `table`.
     """
     from pup.blind.score import score_set
     from pup.blind.table import markdown
+    from services.blind_oracle import Oracle
 
-    scores = score_set(options.set, options.key, options.diagnoses)
+    table = options.out.with_suffix(".md")
+    if options.out.is_dir() or options.out == table:
+        raise InputError(f"--out {options.out}: needs a file for JSON; the table goes to *.md")
+    commitment, journal = read_set(options.set), read_journal(options.diagnoses)
+    if journal and any(journal["set"].get(name) != commitment.get(name) for name in SAME_SET):
+        raise InputError(f"{options.diagnoses / JOURNAL}: tells of a run over another set")
+    with counted("blind score") as tell:
+        oracle = Oracle(options.set, options.diagnoses, tell)
+        scores = score_set(options.set, options.key, options.diagnoses, oracle)
+    scores["engine"] = journal["engine"] if journal else None
     write_json(options.out, scores)
-    table = markdown(scores)
-    write_atomic(options.out.with_suffix(".md"), table)
-    return {**scores, "table": table}
+    page = markdown(scores)
+    write_atomic(table, page)
+    return {**scores, "table": page}
+
+
+ACTIONS = {"make": make, "run": run, "score": score}
 
 
 def show(shown: dict[str, Any]) -> None:
-    """Print the outcome of either job."""
-    print(shown["table"] if "table" in shown else _told(shown))
-
-
-def _told(commitment: dict[str, Any]) -> str:
-    cases = ", ".join(f"{robot} {count}" for robot, count in commitment["cases"].items())
-    return f"cases: {cases}\ncommitment: {commitment['key_sha256']}"
+    """Print the outcome of any of these jobs."""
+    if "table" in shown:
+        print(shown["table"])
+    elif "sessions" in shown:
+        print(f"{shown['cases']} cases diagnosed: {shown['out']}")
+    else:
+        cases = ", ".join(f"{robot} {count}" for robot, count in shown["cases"].items())
+        print(f"cases: {cases}\ncommitment: {shown['key_sha256']}")
 
 
 def folder_of(options: argparse.Namespace) -> Path:
     """The folder that a job needs to write to."""
     out: Path = options.out
-    return out if options.action == "make" else out.parent
+    return out.parent if options.action == "score" else out

@@ -13,6 +13,7 @@ from typing import Any
 
 from pup.errors import InputError
 from pup.robot import RobotDescription
+from services import places
 from services.arguments import parser
 
 DONE, FAILED, REFUSED, STOPPED = 0, 1, 2, 130
@@ -63,9 +64,9 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
             recordings,
             _budget(options, robot),
             out,
-            lambda: _runner(options),
+            lambda: places.fits(options),
             progress,
-            _cores(options),
+            places.cores(options),
         )
     return stages | {
         "report": str(out / "presysid" / "report.html"),
@@ -81,9 +82,9 @@ def _presysid(options: argparse.Namespace) -> dict[str, Any]:
 
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
-    with _folder(options.out) as out, _runner(options) as runner, reporter() as progress:
+    with _folder(options.out) as out, places.fits(options) as runner, reporter() as progress:
         bounds = identify(
-            robot, recordings, _budget(options, robot), out, runner, progress, _cores(options)
+            robot, recordings, _budget(options, robot), out, runner, progress, places.cores(options)
         )
     return {
         "presysid": bounds.document(),
@@ -99,7 +100,7 @@ def _replay(options: argparse.Namespace) -> dict[str, Any]:
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
     with _folder(options.out) as out:
-        return replay(robot, recordings, options.bounds, out, _cores(options))
+        return replay(robot, recordings, options.bounds, out, places.cores(options))
 
 
 def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
@@ -109,8 +110,8 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
 
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
-    with _folder(options.out) as out, _replays(options) as (runner, lanes), stages() as progress:
-        return run_diagnosis(robot, recordings, out, runner, lanes, progress, options.seed)
+    with _folder(options.out) as out, places.replays(options) as where, stages() as progress:
+        return run_diagnosis(robot, recordings, out, where, progress, options.seed)
 
 
 def _import(options: argparse.Namespace) -> dict[str, Any]:
@@ -165,37 +166,7 @@ def _blind(options: argparse.Namespace) -> dict[str, Any]:
     from services import blind
 
     with _folder(blind.folder_of(options)):
-        return blind.make(options) if options.action == "make" else blind.score(options)
-
-
-@contextmanager
-def _runner(options: argparse.Namespace) -> Iterator[Any]:
-    """Where fits run: this process, an embedded Ray or a cluster."""
-    from workers.fits import LocalRunner, RayRunner
-
-    if options.local:
-        yield LocalRunner()
-        return
-    from workers.cluster import connected
-
-    with connected(options.address, options.cores):
-        yield RayRunner()
-
-
-@contextmanager
-def _replays(options: argparse.Namespace) -> Iterator[tuple[Any, int]]:
-    """Where batches of replays run, and how many at once."""
-    if options.local:
-        from pup.diagnosis.replays import Bench, threads
-
-        cores = _cores(options)
-        yield lambda measured: threads(Bench(measured), cores), cores
-        return
-    from workers.cluster import connected
-    from workers.hypotheses import lanes, ray_runner
-
-    with connected(options.address, options.cores):
-        yield ray_runner, lanes()
+        return blind.ACTIONS[options.action](options)
 
 
 def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
@@ -213,10 +184,6 @@ def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
         fixed_network=options.fixed_network,
         seed=options.seed,
     )
-
-
-def _cores(options: argparse.Namespace) -> int:
-    return int(options.cores or len(os.sched_getaffinity(0)))
 
 
 @contextmanager

@@ -1,15 +1,16 @@
 """The diagnosis job: recordings in, `diagnosis.json`, `report.html` and `corrected/` out."""
 
 import hashlib
-import platform
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis, diagnose
-from pup.diagnosis.replays import Runner
+from pup.diagnosis.replays import Bench, Runner, threads
 from pup.diagnosis.report import write_report
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.store import Store
@@ -19,18 +20,45 @@ from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
 from pup.sysid.problem import MODEL
+from services.provenance import versions
+from services.stopwatch import Stopwatch
 
 Progress = Callable[[str, float], None]
+
+DIAGNOSIS = "diagnosis.json"
+CORRECTED = "corrected"
+CHECKPOINTS = "checkpoints"
+"""Goes when the diagnosis is done."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where batches of replays run.
+
+    Attributes:
+      runner: makes what runs them.
+      lanes: how many run at once.
+      here: whether in this process, whose processor time then is the diagnosis's.
+    """
+
+    runner: Callable[[Measured], Runner]
+    lanes: int
+    here: bool
+
+
+def alone(cores: int) -> Where:
+    """In threads of this process."""
+    return Where(lambda measured: threads(Bench(measured), cores), cores, here=True)
 
 
 def run_diagnosis(
     robot: RobotDescription,
     recordings: Sequence[Recording],
     out: Path,
-    runner: Callable[[Measured], Runner],
-    lanes: int,
+    where: Where,
     progress: Progress,
     seed: int = 0,
+    report: bool = True,
 ) -> dict[str, Any]:
     """Diagnose recordings and write the files; run again, it goes on where it was stopped.
 
@@ -38,22 +66,34 @@ def run_diagnosis(
       robot: the robot.
       recordings: of that robot.
       out: folder for `diagnosis.json`, `report.html` and `corrected/`.
-      runner: makes what runs batches of replays.
-      lanes: how many run at once.
+      where: runs batches of replays.
       progress: told the stage and the share of all that is done.
       seed: of everything random.
+      report: whether to write `report.html` too.
 
     Returns:
-      The document of `diagnosis.json`.
+      The document of `diagnosis.json`: that of the contract, and how many `seconds` it took from
+      the first start on; `processor_seconds` too where all was done in this process.
     """
-    store = Store(out / "checkpoints", _digest(robot, recordings))
-    found = diagnose(robot, recordings, lambda m: store.around(runner(m)), lanes, progress, seed)
-    corrected = _write_corrected(found, out)
-    told = document(found, corrected)
-    write_json(out / "diagnosis.json", told)
-    progress("report", 0.98)
-    write_report(found, out / "report.html", _provenance(robot, recordings, told, seed))
-    store.clear()
+    kept = out / CHECKPOINTS
+    watch = Stopwatch(kept / "spent.json", _digest(robot, recordings))
+
+    def runner(measured: Measured) -> Runner:
+        # Planned recordings are replayed too: what is kept of them is not of those measured.
+        store = Store(kept, _digest(robot, measured.recordings))
+        return watch.around(store.around(where.runner(measured)))
+
+    with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads, a verdict must not
+        found = diagnose(robot, recordings, runner, where.lanes, progress, seed)
+    told = document(found, _write_corrected(found, out))
+    seconds, processor = watch.spent()
+    told |= {"seconds": seconds} | ({"processor_seconds": processor} if where.here else {})
+    write_json(out / DIAGNOSIS, told)
+    if report:
+        progress("report", 0.98)
+        write_report(found, out / "report.html", _provenance(robot, recordings, told, seed))
+    watch.clear()
+    Store(kept, "").clear()
     progress("done", 1.0)
     return told
 
@@ -72,7 +112,7 @@ def _write_corrected(found: Diagnosis, out: Path) -> str:
         TermSpec(effect, kind, name, given)  # type: ignore[arg-type]
         for (effect, kind, name), given in terms.items()
     ]
-    folder = out / "corrected"
+    folder = out / CORRECTED
     write_corrected(found.robot, folder, values, known, "Corrected by `pup diagnose`.", "pd")
     return str(folder)
 
@@ -81,12 +121,11 @@ def _provenance(
     robot: RobotDescription, recordings: Sequence[Recording], told: dict[str, Any], seed: int
 ) -> dict[str, Any]:
     """What the diagnosis was made from, and what to record next."""
-    packages = ("pup", "mujoco", "numpy")
     return {
         "robot_digest": robot.digest,
         "recordings": {r.id: r.digest for r in recordings},
         "seed": seed,
-        "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
+        "versions": versions("pup", "mujoco", "numpy"),
         "next_recording": told["next_recording"],
     }
 

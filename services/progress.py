@@ -46,6 +46,32 @@ def stages() -> Iterator[Callable[[str, float], None]]:
     yield tell
 
 
+Told = Callable[..., None]
+"""Told how many cases are done, of how many, what else there is to say, and the share of the work
+that is done and was done at the beginning, for a guess of the time left."""
+
+
+@contextmanager
+def counted(job: str) -> Iterator[Told]:
+    """Tells how many cases of a job are done: a live line on a terminal, plain ones when piped."""
+    begin, live = time.monotonic(), sys.stderr.isatty()
+
+    def tell(done: int, total: int, note: str = "", share: float | None = None) -> None:
+        line = f"{job}: {done}/{total} cases"
+        if share and done < total:
+            left = (time.monotonic() - begin) * (1 - share) / share
+            line += f", {_duration(left)} left"
+        line += f"; {note}" if note else ""
+        start, end = ("\r\x1b[K", "") if live else ("", "\n")
+        print(f"{start}{line}", file=sys.stderr, end=end, flush=True)
+
+    try:
+        yield tell
+    finally:
+        if live:
+            print(file=sys.stderr)
+
+
 class _Clock:
     """Time spent and left in a stage, from the share of generations done since it began."""
 

@@ -22,9 +22,8 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from jobs import Job, until
 from ray.cluster_utils import Cluster
-
-from workers import reaper
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]  # each kills and resumes whole command lines
 BUDGET = (
@@ -32,85 +31,11 @@ BUDGET = (
     *("--subsets", 3, "--subset-generations", 10, "--cores", 2),
 )
 STOPPED = "pup presysid: stopped; the same command resumes\n"
-PATIENCE = 120.0  # s; a busy machine takes its time
 
 
-def until(true: Callable[[], Any], patience: float = PATIENCE) -> None:
-    deadline = time.monotonic() + patience
-    while not true():
-        assert time.monotonic() < deadline, "this should not take so long"
-        time.sleep(0.02)
-
-
-class Job:
-    """A running `pup presysid` in a process group of its own, as a shell has it."""
-
-    def __init__(self, recordings: Path, out: Path, *more: object) -> None:
-        self.out = out
-        command = ("presysid", recordings, "--robot", "darwin_leg", "--out", out, *BUDGET, *more)
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "services.cli", *map(str, command), "--json"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        self.ray: str | None = None
-
-    @property
-    def pid(self) -> int:
-        return self.process.pid
-
-    def started_ray(self) -> str | None:
-        """The folder of the job's embedded Ray, once there is one."""
-        if self.ray is None:
-            for child in psutil.Process(self.pid).children():
-                command = _command(child)
-                if "workers.reaper" in command:
-                    self.ray = command[-2]
-        return self.ray
-
-    def come_to(self, moment: str) -> None:
-        """Wait for a moment of the job: a file below its folder, or the start of its Ray."""
-        if moment == "ray":
-            until(lambda: self.process.poll() is not None or self.started_ray())
-        else:
-            until(lambda: self.process.poll() is not None or list(self.out.glob(moment)))
-        assert self.process.poll() is None, self.process.communicate()
-        self.started_ray()
-
-    def end(self) -> tuple[int, str, str]:
-        """Wait for its end: the exit code, standard output and standard error."""
-        out, err = self.process.communicate(timeout=PATIENCE)
-        return self.process.returncode, out, err
-
-    def left(self) -> list[str]:
-        """Processes of its Ray, and its Ray's folder."""
-        if self.ray is None:
-            return []
-        mark = f"{reaper.SESSION}={self.ray}"
-        found = [self.ray] if Path(self.ray).exists() else []
-        for process in psutil.process_iter():
-            try:
-                environment = [f"{k}={v}" for k, v in process.environ().items()]
-            except psutil.Error:
-                environment = []
-            if mark in environment or any(self.ray in word for word in _command(process)):
-                found.append(f"{process.pid} {' '.join(_command(process))[:100]}")
-        return found
-
-    def assert_nothing_left(self) -> None:
-        deadline = time.monotonic() + 10
-        while left := self.left():
-            assert time.monotonic() < deadline, left
-            time.sleep(0.1)
-
-
-def _command(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:
-        return []
+def presysid(leg_recordings: Path, out: Path, *more: object) -> Job:
+    command = ("presysid", leg_recordings, "--robot", "darwin_leg", *BUDGET, *more)
+    return Job(*command, out=out)
 
 
 def document(out: Path) -> Any:
@@ -129,7 +54,7 @@ def assert_progress_alone(err: str) -> None:
 def wanted(leg_recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """What an undisturbed run finds, in one process."""
     out = tmp_path_factory.mktemp("undisturbed")
-    code, _, err = Job(leg_recordings, out, "--local").end()
+    code, _, err = presysid(leg_recordings, out, "--local").end()
     assert code == 0, err
     assert_progress_alone(err)
     return document(out)
@@ -138,7 +63,7 @@ def wanted(leg_recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> An
 def test_an_undisturbed_run_shows_its_progress_and_cleans_up(
     leg_recordings: Path, tmp_path: Path, wanted: Any
 ) -> None:
-    job = Job(leg_recordings, tmp_path)
+    job = presysid(leg_recordings, tmp_path)
     job.come_to("checkpoints/*.npz")
     code, out, err = job.end()
     job.assert_nothing_left()
@@ -159,14 +84,14 @@ def test_killed_again_and_again(
     if where == "ray":
         moments.insert(0, "ray")
     for moment in moments:
-        job = Job(leg_recordings, tmp_path, *(["--local"] if where == "local" else []))
+        job = presysid(leg_recordings, tmp_path, *(["--local"] if where == "local" else []))
         job.come_to(moment)
         time.sleep(rng.uniform(0, 0.5))
         job.process.kill()
         assert job.end()[0] in (-signal.SIGKILL, 0)
         job.assert_nothing_left()
         assert_checkpoints_whole(tmp_path)
-    last = Job(leg_recordings, tmp_path, *(["--local"] if where == "local" else []))
+    last = presysid(leg_recordings, tmp_path, *(["--local"] if where == "local" else []))
     code, _, err = last.end()
     assert code == 0, err
     last.assert_nothing_left()
@@ -192,7 +117,7 @@ def test_stopped_and_resumed(leg_recordings: Path, tmp_path: Path, wanted: Any, 
         stops.insert(0, ("ray", lambda job: job.process.terminate()))
         stops.insert(1, ("ray", lambda job: os.killpg(job.pid, signal.SIGINT)))
     for moment, stop in stops:
-        job = Job(leg_recordings, tmp_path, *local)
+        job = presysid(leg_recordings, tmp_path, *local)
         job.come_to(moment)
         stop(job)
         code, out, err = job.end()
@@ -201,7 +126,7 @@ def test_stopped_and_resumed(leg_recordings: Path, tmp_path: Path, wanted: Any, 
         assert err.endswith(STOPPED)
         assert_progress_alone(err.removesuffix(STOPPED))
         job.assert_nothing_left()
-    last = Job(leg_recordings, tmp_path, *local)
+    last = presysid(leg_recordings, tmp_path, *local)
     code, _, err = last.end()
     assert code == 0, err
     assert document(tmp_path) == wanted
@@ -245,7 +170,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def test_a_lost_node_changes_nothing(
     leg_recordings: Path, tmp_path: Path, wanted: Any, cluster: Any
 ) -> None:
-    job = Job(leg_recordings, tmp_path, "--address", cluster.address)
+    job = presysid(leg_recordings, tmp_path, "--address", cluster.address)
     job.come_to("checkpoints/*.npz")
     cluster.remove_node(cluster.workers[0], allow_graceful=False)
     code, out, err = job.end()
@@ -254,7 +179,7 @@ def test_a_lost_node_changes_nothing(
     assert len(out.splitlines()) == 1
     assert document(tmp_path) == wanted
     # And a job that is stopped takes all of its own with it.
-    again = Job(leg_recordings, tmp_path / "again", "--address", cluster.address)
+    again = presysid(leg_recordings, tmp_path / "again", "--address", cluster.address)
     again.come_to("checkpoints/*.npz")
     os.killpg(again.pid, signal.SIGINT)
     code, _, err = again.end()
@@ -278,7 +203,7 @@ def test_no_cluster_at_the_address(leg_recordings: Path, tmp_path: Path, scheme:
         free.bind(("127.0.0.1", 0))
         address = f"{scheme}127.0.0.1:{free.getsockname()[1]}"
         begin = time.monotonic()
-        code, out, err = Job(leg_recordings, tmp_path, "--address", address).end()
+        code, out, err = presysid(leg_recordings, tmp_path, "--address", address).end()
     assert code == 2
     assert out == ""
     (line,) = err.splitlines()

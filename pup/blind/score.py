@@ -30,8 +30,9 @@ class Replayed:
     corrected: float
 
 
-Replay = Callable[[Path, Sequence[Recording]], Replayed]
-"""Replays the folder of a diagnosis, with its `corrected/`, on test recordings."""
+Replay = Callable[[Path, Sequence[Recording]], Replayed | None]
+"""Replays the folder of a diagnosis, with its `corrected/`, on test recordings; None where the
+diagnosis does not tell the refitted nominal model."""
 
 
 def score_set(
@@ -193,6 +194,8 @@ def _oracle(truth: Mapping[str, Any], tests: Path, diagnosed: Path, replay: Repl
     if not tests.is_dir() or not (diagnosed / "corrected").is_dir():
         return None
     errors = replay(diagnosed, load_recordings([tests]))
+    if errors is None:
+        return None
     # Who knows the form and refits everything is left with the noise.
     best = float(truth["noise"]["sigma"])
     possible = errors.nominal - best

@@ -64,6 +64,21 @@ def commit(folder: Path, key: Path, counts: Mapping[str, int]) -> dict[str, Any]
     return commitment
 
 
+def read_set(folder: Path) -> dict[str, Any]:
+    """Check a set against its commitment.
+
+    Returns:
+      The commitment.
+
+    Raises:
+      InputError: the folder is no set, or a recording is not the one committed to.
+    """
+    commitment = _commitment(folder)
+    if commitment.get("recordings_sha256") != digest_of_set(folder):
+        raise InputError(f"{folder}: its recordings are not those that its commitment names")
+    return commitment
+
+
 def verify(folder: Path, key: Path) -> dict[str, Any]:
     """Check a key and a set against the commitment.
 
@@ -71,13 +86,21 @@ def verify(folder: Path, key: Path) -> dict[str, Any]:
       The key.
 
     Raises:
-      InputError: the key or a recording is not the one committed to.
+      InputError: the folder is no set, or the key or a recording is not the one committed to.
     """
-    commitment = read_json(folder / COMMITMENT)
-    if not isinstance(commitment, dict) or commitment.get("schema") != 1:
-        raise InputError(f"{folder / COMMITMENT}: not a commitment of a blind set (schema 1)")
-    if commitment.get("key_sha256") != digest_of_key(key):
+    if _commitment(folder).get("key_sha256") != digest_of_key(key):
         raise InputError(f"{key}: not the key that {folder / COMMITMENT} commits to")
-    if commitment.get("recordings_sha256") != digest_of_set(folder):
-        raise InputError(f"{folder}: its recordings are not those that its commitment names")
+    read_set(folder)
     return read_key(key)
+
+
+def _commitment(folder: Path) -> dict[str, Any]:
+    file = folder / COMMITMENT
+    if not file.is_file():
+        raise InputError(
+            f"{folder}: no {COMMITMENT} in it; name the folder of a set that is completely made"
+        )
+    commitment = read_json(file)
+    if not isinstance(commitment, dict) or commitment.get("schema") != 1:
+        raise InputError(f"{file}: not a commitment of a blind set (schema 1)")
+    return commitment

@@ -38,8 +38,9 @@ def markdown(scores: Mapping[str, Any]) -> str:
     lines = [
         f"# Blind score: {scores['cases']} cases, {scores['missing']} without a diagnosis",
         "",
-        f"Commitment {scores['commitment']['key_sha256']}, "
-        f"engine {scores['commitment']['engine_git_sha'] or 'not named'}.",
+        f"Commitment {scores['commitment']['key_sha256']}, to engine "
+        f"{scores['commitment']['engine_git_sha'] or 'not named'}; "
+        f"diagnosed by {_engine(scores.get('engine'))}.",
         "",
         "| omissions | value | 95 % |",
         "|---|---|---|",
@@ -64,6 +65,14 @@ def markdown(scores: Mapping[str, Any]) -> str:
         ),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _engine(told: Mapping[str, Any] | None) -> str:
+    """The engine that diagnosed, where its run is told of."""
+    if told is None:
+        return "an engine not told of"
+    changes = " with changes" if told["dirty"] else ""
+    return f"{told['git_sha'] or 'an engine without a commit'}{changes}"
 
 
 def _row(told: str, value: Mapping[str, Any]) -> str:

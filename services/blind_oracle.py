@@ -1,0 +1,72 @@
+"""How well diagnoses predict motions that they were never given."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pup.blind.score import Replayed
+from pup.diagnosis.residuals import LOST, Measured
+from pup.files import read_json
+from pup.physics.mujoco_batch import MujocoSimulator
+from pup.physics.parameters import ParameterSpace, robot_space
+from pup.recording import Recording
+from pup.robot import RobotDescription
+from services.diagnosis import CORRECTED, DIAGNOSIS
+
+LAW = "pd"
+"""Torque law of the nominal model (CONTRACTS.md, section 2)."""
+
+
+class Oracle:
+    """Replays diagnoses of a blind set, and tells how many are done.
+
+    Args:
+      folder: the set.
+      diagnoses: its diagnoses.
+      tell: see `progress.counted`.
+    """
+
+    def __init__(self, folder: Path, diagnoses: Path, tell: Callable[..., None]) -> None:
+        tests = (path.parent.name for path in folder.glob("case_*/test"))
+        self.total = sum((diagnoses / case / CORRECTED).is_dir() for case in tests)
+        self.done, self.tell = 0, tell
+
+    def __call__(self, diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:
+        """See `score.Replay`."""
+        told = replayed(diagnosed, tests)
+        self.done += 1
+        self.tell(self.done, self.total, share=self.done / self.total)
+        return told
+
+
+def replayed(diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:
+    """Replay the refitted nominal model and the corrected robot of a diagnosis.
+
+    Args:
+      diagnosed: the diagnosis's folder.
+      tests: recordings of motions it was not given.
+
+    Returns:
+      The errors; None where the document does not tell the nominal model.
+    """
+    document = read_json(diagnosed / DIAGNOSIS)
+    if not isinstance(document.get("nominal"), dict):
+        return None
+    robot = RobotDescription.load(document["robot"])
+    corrected = RobotDescription.load(diagnosed / CORRECTED)
+    refitted = robot_space(robot, LAW).at(document["nominal"])
+    return Replayed(
+        nominal=_error(robot, refitted, tests),
+        corrected=_error(corrected, robot_space(corrected, LAW), tests),
+    )
+
+
+def _error(robot: RobotDescription, space: ParameterSpace, tests: Sequence[Recording]) -> float:
+    """Root mean square of the joints' errors, rad, on the samples that a diagnosis looks at."""
+    measured = Measured.of(robot, tests)
+    simulator = MujocoSimulator(robot, measured.recordings, LAW)
+    simulated = measured.pick(simulator.replay(space.candidates()))[0]
+    errors = np.where(np.isnan(simulated), LOST, measured.values - simulated)
+    joints = measured.channel < len(robot.joints)
+    return float(np.sqrt(np.mean(errors[joints] ** 2)))

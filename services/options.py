@@ -1,0 +1,140 @@
+"""Options that several verbs share, and what can be written behind them."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pup.robot import built_in_robots
+
+
+def recordings(verb: argparse.ArgumentParser) -> None:
+    """What is read."""
+    verb.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="Parquet file, or a folder of them",
+    )
+
+
+def robot(to: Any, more: str = "", **options: Any) -> None:
+    """Whose recordings they are."""
+    names = ", ".join(built_in_robots())
+    to.add_argument("--robot", help=f"{names}, or a robot's folder{more}", **options)
+
+
+def out(verb: argparse.ArgumentParser, what: str) -> None:
+    """Where files go."""
+    verb.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help=f"folder for {what}; made when absent",
+    )
+
+
+def actuator(to: Any) -> None:
+    """Which torque law."""
+    to.add_argument(
+        "--actuator",
+        choices=("nn_pd", "pd"),
+        help="torque law; default: nn_pd where the robot has a network, else pd",
+    )
+
+
+def seed(to: Any, more: str = "") -> None:
+    """What is drawn."""
+    to.add_argument(
+        "--seed",
+        type=number(0, 2**31),
+        default=0,
+        metavar="N",
+        help=f"of everything random{more}; default: %(default)s",
+    )
+
+
+def budget(verb: argparse.ArgumentParser, generations: int, subset_generations: int) -> None:
+    """How much pre-sysID does."""
+    budget = verb.add_argument_group("what is fitted, and how long")
+    actuator(budget)
+    for name, limits, default, told in (
+        ("--generations", (1, 100_000), generations, "of each nominal fit"),
+        ("--population", (4, 4096), 16, "candidates per generation"),
+        ("--subsets", (1, 1000), 10, "random subsets of the recordings for the bounds"),
+        ("--subset-generations", (1, 100_000), subset_generations, "of each subset's fit"),
+        ("--folds", (0, 100), 0, "leave-recordings-out fits for a held-out error, 0 for none"),
+    ):
+        budget.add_argument(
+            name,
+            type=number(*limits),
+            default=default,
+            metavar="N",
+            help=f"{told}; default: %(default)s",
+        )
+    budget.add_argument(
+        "--fraction",
+        type=number(0.0, 1.0, float),
+        default=0.1,
+        metavar="F",
+        help="share of the recordings in a subset, at least two; default: %(default)s",
+    )
+    budget.add_argument(
+        "--no-comparison", action="store_true", help="do not fit the other torque law"
+    )
+    budget.add_argument(
+        "--fixed-network", action="store_true", help="keep the robot's network weights"
+    )
+    seed(budget)
+
+
+def place(verb: argparse.ArgumentParser) -> None:
+    """Where a job runs."""
+    place = verb.add_argument_group("where it runs")
+    where = place.add_mutually_exclusive_group()
+    where.add_argument("--address", help="of a running Ray cluster; default: an embedded Ray")
+    where.add_argument("--local", action="store_true", help="in this process alone, without Ray")
+    cores(place)
+
+
+def cores(to: Any) -> None:
+    """How many cores it takes."""
+    to.add_argument("--cores", type=number(1, 4096), metavar="N", help="cores to use; default: all")
+
+
+def number(low: float, high: float, kind: type = int) -> Callable[[str], Any]:
+    """An argument type: a number within limits."""
+    wanted = "a whole number" if kind is int else "a number"
+
+    def parse(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}") from error
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text} is not between {low:.10g} and {high:.10g}")
+        return value
+
+    return parse
+
+
+def knob(text: str) -> tuple[str, float]:
+    """An argument type: what a knob is set to."""
+    name, _, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        name = ""
+    if not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not KNOB=NUMBER")
+    return name, number
+
+
+def count(text: str) -> tuple[str, int]:
+    """An argument type: how many cases of a robot."""
+    name, _, value = text.rpartition("=")
+    if not name or not value.isdecimal() or not 0 <= int(value) <= 10_000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=COUNT, with 0 to 10000 cases")
+    return name, int(value)

@@ -1,0 +1,98 @@
+"""A `pup` that runs in a process group of its own, to be stopped and killed."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from workers import reaper
+
+PATIENCE = 120.0  # s; a busy machine takes its time
+
+
+def until(true: Callable[[], Any], patience: float = PATIENCE) -> None:
+    deadline = time.monotonic() + patience
+    while not true():
+        assert time.monotonic() < deadline, "this should not take so long"
+        time.sleep(0.02)
+
+
+class Job:
+    """A running `pup`, as a shell has it.
+
+    Args:
+      command: its arguments.
+      out: the folder that it writes to.
+    """
+
+    def __init__(self, *command: object, out: Path) -> None:
+        self.out = out
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "services.cli", *map(str, command), "--out", str(out), "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.ray: str | None = None
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def started_ray(self) -> str | None:
+        """The folder of the job's embedded Ray, once there is one."""
+        if self.ray is None:
+            for child in psutil.Process(self.pid).children():
+                command = command_of(child)
+                if "workers.reaper" in command:
+                    self.ray = command[-2]
+        return self.ray
+
+    def come_to(self, moment: str, files: int = 1) -> None:
+        """Wait for a moment of the job: some files below its folder, or the start of its Ray."""
+        if moment == "ray":
+            until(lambda: self.process.poll() is not None or self.started_ray())
+        else:
+            until(
+                lambda: self.process.poll() is not None or len(list(self.out.glob(moment))) >= files
+            )
+        assert self.process.poll() is None, self.process.communicate()
+        self.started_ray()
+
+    def end(self, patience: float = PATIENCE) -> tuple[int, str, str]:
+        """Wait for its end: the exit code, standard output and standard error."""
+        out, err = self.process.communicate(timeout=patience)
+        return self.process.returncode, out, err
+
+    def left(self) -> list[str]:
+        """Processes of its Ray, and its Ray's folder."""
+        if self.ray is None:
+            return []
+        mark = f"{reaper.SESSION}={self.ray}"
+        found = [self.ray] if Path(self.ray).exists() else []
+        for process in psutil.process_iter():
+            try:
+                environment = [f"{k}={v}" for k, v in process.environ().items()]
+            except psutil.Error:
+                environment = []
+            if mark in environment or any(self.ray in word for word in command_of(process)):
+                found.append(f"{process.pid} {' '.join(command_of(process))[:100]}")
+        return found
+
+    def assert_nothing_left(self) -> None:
+        deadline = time.monotonic() + 10
+        while left := self.left():
+            assert time.monotonic() < deadline, left
+            time.sleep(0.1)
+
+
+def command_of(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
