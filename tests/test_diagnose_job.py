@@ -1,0 +1,112 @@
+"""`pup diagnose` as users run it: on Ray the same as without, killed and gone on with the same."""
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blind_sets import FRICTION, motions
+from commandline import pup
+from jobs import Job
+
+from pup.recording import write_recordings
+from services.stopwatch import Stopwatch
+
+STOPPED = "pup diagnose: stopped; the same command resumes\n"
+RAY = ("--cores", 2)
+KEPT = "checkpoints/*.f32"
+TIMES = ("seconds", "processor_seconds", "corrected_robot")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings of a servo with friction."""
+    folder = tmp_path_factory.mktemp("runs")
+    write_recordings(motions(FRICTION)[0], folder)
+    return folder
+
+
+def diagnose(runs: Path, out: Path, *where: object) -> Job:
+    return Job("diagnose", runs, "--robot", "servo_bench", *where, out=out)
+
+
+def told(out: Path) -> Any:
+    """What was found, but for the time it took and the place it is at."""
+    document = json.loads((out / "diagnosis.json").read_text())
+    return {name: value for name, value in document.items() if name not in TIMES}
+
+
+@pytest.fixture(scope="module")
+def wanted(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What an undisturbed run leaves, in one process."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    done = pup("diagnose", runs, "--robot", "servo_bench", "--local", "--cores", 1, "--out", out)
+    assert done.code == 0, done.err
+    return out
+
+
+def corrected(out: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in (out / "corrected").iterdir()}
+
+
+def assert_same(out: Path, wanted: Path) -> None:
+    assert told(out) == told(wanted)
+    assert corrected(out) == corrected(wanted)
+    assert not (out / "checkpoints").exists()
+    assert (out / "report.html").exists()
+
+
+def test_it_tells_how_long_it_took(wanted: Path) -> None:
+    document = json.loads((wanted / "diagnosis.json").read_text())
+    assert document["verdict"] == "mismatch"
+    assert 0 < document["processor_seconds"] < 1.5 * document["seconds"]
+    assert not (wanted / "checkpoints").exists()
+
+
+def test_killed_again_and_again(runs: Path, tmp_path: Path, wanted: Path) -> None:
+    for kept in (3, 12, 30):
+        job = diagnose(runs, tmp_path, "--local", "--cores", 1)
+        job.come_to(KEPT, kept)
+        job.process.kill()
+        assert job.end()[0] == -signal.SIGKILL
+        assert not (tmp_path / "diagnosis.json").exists()
+    spent = Stopwatch(tmp_path / "checkpoints" / "spent.json", "of another job")
+    assert spent.before == (0.0, 0.0)
+    before = json.loads(spent.file.read_text())["spent"]
+    code, _, err = diagnose(runs, tmp_path, "--local", "--cores", 1).end()
+    assert code == 0, err
+    assert_same(tmp_path, wanted)
+    assert json.loads((tmp_path / "diagnosis.json").read_text())["seconds"] > before[0] > 0
+
+
+@pytest.mark.ray
+def test_on_ray_it_is_the_same(runs: Path, tmp_path: Path, wanted: Path) -> None:
+    job = diagnose(runs, tmp_path, *RAY)
+    job.come_to("ray")
+    code, out, err = job.end()
+    assert code == 0, err
+    job.assert_nothing_left()
+    document = json.loads(out)
+    assert document == json.loads((tmp_path / "diagnosis.json").read_text())
+    assert "processor_seconds" not in document  # the driver's says nothing
+    assert_same(tmp_path, wanted)
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_killed_on_ray_and_stopped(runs: Path, tmp_path: Path, wanted: Path) -> None:
+    job = diagnose(runs, tmp_path, *RAY)
+    job.come_to(KEPT, 5)
+    job.process.kill()
+    assert job.end()[0] == -signal.SIGKILL
+    job.assert_nothing_left()
+    job = diagnose(runs, tmp_path, *RAY)
+    job.come_to(KEPT, 20)
+    job.process.terminate()
+    code, out, err = job.end()
+    assert (code, out) == (130, "") and err.endswith(STOPPED)
+    job.assert_nothing_left()
+    code, _, err = diagnose(runs, tmp_path, *RAY).end()
+    assert code == 0, err
+    assert_same(tmp_path, wanted)
