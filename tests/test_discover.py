@@ -96,8 +96,8 @@ def test_a_law_outside_the_library_is_found_and_predicts_other_motions() -> None
     name, size = "cos(4q)", 0.05
     replays = replays_of(measured_under(BENCH, law(name, size), ("step", "sine", "walk")))
     fit, noise = fitted(replays)
-    selector = Selector(replays, noise, (), ENOUGH)
-    before = selector.model((), fit)
+    selector = Selector(replays, noise, (), ENOUGH, fit)
+    before = selector.nominal
     told = unexplained(before, selector, ())
     assert told is not None
     assert told.finding.effect == "unknown"
@@ -116,5 +116,5 @@ def test_noise_alone_is_not_called_unknown() -> None:
     for seed in range(3):
         replays = replays_of(measured_under(BENCH, {}, seed=seed))
         fit, noise = fitted(replays)
-        selector = Selector(replays, noise, (), ENOUGH)
-        assert unexplained(selector.model((), fit), selector, ()) is None
+        selector = Selector(replays, noise, (), ENOUGH, fit)
+        assert unexplained(selector.nominal, selector, ()) is None

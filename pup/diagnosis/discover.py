@@ -18,7 +18,7 @@ from pup.diagnosis.locate import BAND, MissingInput, explained_by
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import KEPT, Model, Selector
-from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter
+from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter, doubt
 from pup.physics.terms import Place
 from pup.physics.terms.learned import LearnedLaw, unit
 from pup.robot import TermSpec
@@ -31,6 +31,8 @@ SURPRISE = 4.5
 """Standard deviations from which errors are more than noise."""
 MATERIAL = 0.09
 """Mean square of a channel's unexplained errors, in that of its noise, that matters."""
+FORM = 0.05
+"""Share of its own trace that a wrong form of a known effect may leave."""
 UNSURE = {"repeats": 0.05, "assumed": 0.15}
 """By what share the noise floor's variance may be wrong."""
 BLOCK = 0.5
@@ -103,7 +105,8 @@ def unexplained(
     missing = explained_by(answers, fit)
     lacks = lack_of_fit(measured, fit.residual, missing, UNSURE[selector.noise.source])
     flagged = [lack for lack in lacks if _matters(lack, missing)]
-    if not flagged:
+    excess = float(fit.residual @ fit.residual) - len(fit.residual)
+    if not flagged or excess < selector.blur(model, FORM):
         return None
     place, joints = _place(measured, missing, flagged)
     tried: list[Law] = []
@@ -122,7 +125,7 @@ def unexplained(
             regime=strongest(found, gain),
             when=tuple(windows(measured, gain)),
             parameters={} if law is None else _parameters(law, place, corrected),
-            probability=1 - UNKNOWN,
+            probability=_probability(model, selector),
             equivalents=(),
             absorbed_by={},
             law=None if law is None else str(law),
@@ -134,6 +137,11 @@ def unexplained(
         corrected,
         () if law is None else (_term(law, place),),
     )
+
+
+def _probability(model: Model, selector: Selector) -> float:
+    """That there is something without a name: sure alone, else by what named effects leave."""
+    return doubt(selector.nominal, model) if model.hypotheses else 1 - UNKNOWN
 
 
 def lack_of_fit(

@@ -140,9 +140,9 @@ def diagnose(
     if not found:
         return told("undetermined", "the motions would not show any effect of the library")
     enough = threshold(found, rng, FALSE_ALARMS)
-    selector = Selector(replays, nominal.noise, found, enough)
+    selector = Selector(replays, nominal.noise, found, enough, nominal.fit)
     progress("refits", 0.5)
-    model, rounds = selector.run(nominal.fit)
+    model, rounds = selector.run()
     before = rounds[0].before if rounds else model
     if model.fit.jacobian is None:
         differentiate([model.fit], replays, nominal.noise)

@@ -19,7 +19,7 @@ from pup.diagnosis.menu import Option, options
 from pup.diagnosis.replays import Replays, Row
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Round, Selector
-from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
+from pup.diagnosis.verdict import Finding
 from pup.physics.terms import Place, split_column
 from pup.robot import RobotDescription
 
@@ -106,12 +106,13 @@ def rivals_of(finding: Finding, chosen: Round, selector: Selector) -> list[Rival
       chosen: the round that found it.
       selector: knows the replays and the noise.
     """
-    chances, _ = probabilities(chosen.finalists)
+    known = {(e.effect, e.place): e.probability for e in finding.equivalents}
+    known[finding.effect, finding.place] = finding.probability
     found: dict[tuple[str, Place], Rival] = {}
-    for model, chance in zip(chosen.finalists, chances, strict=True):
+    for model in chosen.finalists:
         key = model.hypotheses[-1].key
-        if chance >= WORTH_SAYING or key == (finding.effect, finding.place):
-            found.setdefault(key, Rival(*key, float(chance), model.fit))
+        if key in known:
+            found.setdefault(key, Rival(*key, known[key], model.fit))
     for other in finding.equivalents:
         if (other.effect, other.place) not in found:
             fit = _refitted(other.effect, other.place, chosen, selector)

@@ -27,7 +27,7 @@ DAMPINGS = (0.1, 1.0, 10.0)
 ENOUGH = 0.05
 """A fit has ended when no step lowers chi-squared by as much."""
 ALMOST = 1e-9
-CHEAP = 400
+CHEAP = 100
 """Simulations that a replay may have beside those it needs, for Jacobians of its trials."""
 PATIENCE = 2
 """Accepted steps for which an updated Jacobian is trusted."""

@@ -20,9 +20,9 @@ Array = NDArray[np.float64]
 STARTS = 3
 SPREAD = 0.35
 """Of the starts around the nominal values, in logarithms."""
-AGREEMENT = 1e-3
+AGREEMENT = 3e-3
 """Two starts agree in chi-squared to this share of it, or to ABSOLUTE."""
-ABSOLUTE = 2.0
+ABSOLUTE = 5.0
 WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
 """Widths of finite differences with which starts that disagree are taken further."""
 SELF = 3.0

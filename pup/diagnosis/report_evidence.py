@@ -57,7 +57,7 @@ def evidence(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
             beside = f", beside {listed(known)}" if known else ""
             yield tag("h3", f"Round {number}{beside}")
         yield from _ranking(diagnosis, speech, chosen.ranking, chosen)
-        yield from _refits(speech, chosen)
+        yield from _refits(diagnosis, speech, chosen)
 
 
 def _ranking(
@@ -90,9 +90,9 @@ def _ranking(
     )
 
 
-def _refits(speech: Speech, chosen: Round) -> Iterator[Html]:
+def _refits(diagnosis: Diagnosis, speech: Speech, chosen: Round) -> Iterator[Html]:
     """The finalists after their refits, and why they fell behind."""
-    finalists = summary.rivals(chosen)
+    finalists = summary.rivals(chosen, diagnosis.model)
     if not finalists:
         yield tag("p", f"{capital(summary.why_rejected(chosen))}.")
         return
@@ -160,7 +160,7 @@ def hiding(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
 
 def _masked(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     """How nominal parameters imitate the finalists."""
-    finalists = [r for chosen in diagnosis.rounds for r in summary.rivals(chosen)]
+    finalists = [r for chosen in diagnosis.rounds for r in summary.rivals(chosen, diagnosis.model)]
     fit = diagnosis.nominal.fit
     traces = {t.hypothesis: t for t in diagnosis.found}
     told: dict[object, tuple[str, float, Array]] = {}

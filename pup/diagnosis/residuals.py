@@ -159,13 +159,13 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
     for channel in range(measured.channels):
         parts = [d[channel] for d in differences if channel in d]
         if parts:
-            told[channel] = _spread(parts, scale=1.0)
+            told[channel] = _spread(parts)
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
     if not told:
         for channel in range(measured.channels):
             flicker = _flicker(measured, errors, channel)
             if flicker:
-                told[channel] = _spread(flicker, scale=1.0)
+                told[channel] = flicker
     return _pooled(measured, told, source)
 
 
@@ -190,16 +190,21 @@ def _pooled(
     return Noise(sigma, rho, source)
 
 
-def _spread(parts: Sequence[Array], scale: float) -> tuple[float, float]:
+def _spread(parts: Sequence[Array]) -> tuple[float, float]:
     """Standard deviation and lag-one correlation of some runs of differences."""
+    variance, follows = _moments(parts)
+    return float(np.sqrt(variance)), follows / max(variance, 1e-300)
+
+
+def _moments(parts: Sequence[Array]) -> tuple[float, float]:
+    """Variance and lag-one covariance of some runs."""
     squares = np.concatenate([p**2 for p in parts])
     # A foot that slips once or a lost packet is no noise: the mean of all but the largest.
     cut = float(np.quantile(squares, 0.98)) if len(squares) > 50 else np.inf
     variance = float(np.mean(np.minimum(squares, cut)))
     if np.isfinite(cut):
         variance /= NORMAL_CUT
-    products = np.concatenate([p[1:] * p[:-1] for p in parts])
-    return scale * float(np.sqrt(variance)), float(np.mean(products) / max(variance, 1e-300))
+    return variance, float(np.mean(np.concatenate([p[1:] * p[:-1] for p in parts])))
 
 
 def _repeats(measured: Measured) -> list[tuple[int, int]]:
@@ -236,9 +241,13 @@ def _difference(measured: Measured, errors: Array, a: int, b: int) -> dict[int, 
     return out
 
 
-def _flicker(measured: Measured, errors: Array, channel: int) -> list[Array]:
-    """Bends of a channel's errors while no command changes, scaled to one reading."""
-    runs = []
+def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, float] | None:
+    """Noise of a channel, from how its errors flicker while no command changes.
+
+    Where commands never rest, the quieter half of all that bends stands for rest.
+    """
+    rests: list[Array] = []
+    bends: list[Array] = []
     for number, recording in enumerate(measured.recordings):
         chosen = (measured.recording == number) & (measured.channel == channel)
         if chosen.sum() < 8:
@@ -247,13 +256,17 @@ def _flicker(measured: Measured, errors: Array, channel: int) -> list[Array]:
         elapsed = recording.time - recording.time[0]
         last = np.maximum.accumulate(np.where(np.r_[False, changed], elapsed, 0.0))
         still = np.interp(measured.time[chosen], elapsed, elapsed - last) > STILL
-        bend = errors[chosen][2:] - 2 * errors[chosen][1:-1] + errors[chosen][:-2]
-        calm = still[2:] & still[1:-1] & still[:-2]
-        # Where commands never rest, the quieter half of all bends stands for rest.
-        kept = bend[calm] if calm.sum() >= 8 else bend[np.abs(bend) <= np.median(np.abs(bend))] * 2
-        if len(kept) >= 4:
-            runs.append(kept / np.sqrt(6.0))
-    return [np.concatenate(runs)] if runs else []
+        step = np.diff(errors[chosen])
+        calm = still[1:] & still[:-1]
+        parts = np.split(step, np.flatnonzero(np.diff(calm)) + 1)[0 if calm[0] else 1 :: 2]
+        rests += [part for part in parts if len(part) >= 4]
+        bend = np.abs(np.diff(step))
+        bends.append(2 * bend[bend <= np.median(bend)])
+    if sum(map(len, rests)) >= 8:
+        variance, follows = _moments(rests)
+        rho = float(np.clip(1 + 2 * follows / max(variance, 1e-300), 0.0, 0.9))
+        return float(np.sqrt(variance / (2 * (1 - rho)))), rho
+    return (float(np.sqrt(_moments(bends)[0] / 6)), 0.0) if bends else None
 
 
 def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:

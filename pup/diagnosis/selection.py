@@ -16,6 +16,8 @@ from pup.diagnosis.fitting import Coordinate, Fit, differentiate, fit_together, 
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
+from pup.physics.terms import Place
+from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 
@@ -29,8 +31,16 @@ CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
 MOST = 8
 """Effects that are looked for."""
+NOMINAL, TYPICAL = 0.2, 0.5
+"""How far a coordinate is believed to move when a fold is left out: a logarithm, a typical size."""
 KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""
+FORM = 0.03
+"""Share of its own trace by which an effect's form may be wrong: what is left of one that was found
+is no evidence of another."""
+REST = 0.3
+"""Share of what others left at its joints that a further effect explains: a wrong form of theirs is
+made up for by many small effects, a second effect by one."""
 MATERIAL = 0.3
 """An effect is material if it explains an error of this share of the noise, ..."""
 SIZABLE = 0.25
@@ -93,20 +103,27 @@ class Selector:
       noise: weighs the samples.
       found: traces of all hypotheses around the nominal fit.
       enough: surprise that chance does not reach.
+      nominal: the nominal fit, with its Jacobian.
     """
 
     def __init__(
-        self, replays: Replays, noise: Noise, found: Sequence[Trace], enough: float
+        self,
+        replays: Replays,
+        noise: Noise,
+        found: Sequence[Trace],
+        enough: float,
+        nominal: Fit,
     ) -> None:
         self.replays = replays
         self.noise = noise
         self.found = tuple(found)
         self.enough = enough
         self.folds = _folds(replays)
+        self.nominal = self.model((), nominal)
 
-    def run(self, nominal: Fit) -> tuple[Model, list[Round]]:
+    def run(self) -> tuple[Model, list[Round]]:
         """The model that is left when nothing more is worth adding, and how it came about."""
-        model = self.model((), nominal)
+        model = self.nominal
         rounds: list[Round] = []
         while len(model.hypotheses) < MOST:
             chosen = self._round(model)
@@ -145,6 +162,21 @@ class Selector:
         finalists = sorted(self._held_out(better), key=lambda m: m.worth)
         return Round(model, tuple(ranking), tuple(finalists), self._holds(model, finalists[0]))
 
+    def _second(self, before: Model, after: Model) -> bool:
+        """Whether an effect is more than what is wrong in the forms of those at its joints."""
+        robot = self.replays.measured.robot
+        own = _joints(after.hypotheses[-1].place, robot)
+        if not any((own & _joints(h.place, robot)).any() for h in before.hypotheses):
+            return True
+        here = own[self.replays.measured.channel]
+        assert before.fit.residual is not None and after.fit.residual is not None
+        then, now = before.fit.residual[here] ** 2, after.fit.residual[here] ** 2
+        return float((then - now).sum()) > REST * float((then - 1).sum())
+
+    def blur(self, model: Model, share: float = FORM) -> float:
+        """Chi-squared that wrong forms of a model's effects may leave."""
+        return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
+
     def _refit(self, fits: Sequence[Fit]) -> None:
         """Refit finalists, all of them roughly and the best of them to the end."""
         fit_together(fits, self.replays, self.noise, iterations=ROUGH)
@@ -159,6 +191,8 @@ class Selector:
         inside = before.fit.chi2 - after.fit.chi2
         outside = float((before.held_out - after.held_out).sum())
         if outside <= max(KEPT * inside, 0.5 * self.enough):
+            return False
+        if inside <= self.blur(before) or not self._second(before, after):
             return False
         return _material(after.hypotheses[-1], before, after)
 
@@ -211,29 +245,48 @@ class Selector:
     def _held_out(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
         """Models with the predictions of fits without each fold.
 
-        A fit without a fold starts where the whole fit ends, and takes one Gauss-Newton step.
+        A fit without a fold starts where the whole fit ends, and takes one Gauss-Newton step. A
+        long one, along what the other folds hardly see, leaves the valley that a fit would follow:
+        then what the Jacobian says of the fold is nearer to what that fit would say.
         """
         differentiate([fit for _, fit in fitted if fit.jacobian is None], self.replays, self.noise)
         measured = self.replays.measured
         costs = np.zeros((len(fitted), len(self.folds)))
         predicted = np.tile(measured.values, (len(fitted), 1))
         insides = [measured.only(fold) for fold in self.folds]
+        moved = [[_step_without(fit, inside) for _, fit in fitted] for inside in insides]
         asked = [
-            ([fit.row(_step_without(fit, inside)) for _, fit in fitted], fold)
-            for inside, fold in zip(insides, self.folds, strict=True)
+            ([fit.row(at) for (_, fit), at in zip(fitted, points, strict=True)], fold)
+            for points, fold in zip(moved, self.folds, strict=True)
         ]
-        for number, (inside, simulated) in enumerate(
-            zip(insides, self.replays.together(asked), strict=True)
+        for number, (inside, points, simulated) in enumerate(
+            zip(insides, moved, self.replays.together(asked), strict=True)
         ):
             told = np.where(np.isnan(simulated), LOST, simulated)
             predicted[:, inside] = told
             errors = np.zeros((len(fitted), len(measured.values)))
             errors[:, inside] = measured.values[inside] - told
-            costs[:, number] = (measured.whiten(errors, self.noise)[:, inside] ** 2).sum(axis=1)
+            simulated_costs = (measured.whiten(errors, self.noise)[:, inside] ** 2).sum(axis=1)
+            costs[:, number] = np.minimum(
+                simulated_costs,
+                [_linear(fit, at, inside) for (_, fit), at in zip(fitted, points, strict=True)],
+            )
         return [
             Model(hypotheses, self._freedom(hypotheses), fit, cost, values)
             for (hypotheses, fit), cost, values in zip(fitted, costs, predicted, strict=True)
         ]
+
+
+def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
+    """The channels of the joints at a place; all channels where it is none of some joints."""
+    chosen = np.zeros(len(robot.joints) + 2, dtype=bool)
+    if place.kind == "joint":
+        chosen[robot.joint_names.index(place.name)] = True
+    elif place.kind == "group":
+        chosen[:-2] = robot.group_index == robot.groups.index(place.name)
+    else:
+        chosen[:] = True
+    return chosen
 
 
 def _material(hypothesis: Hypothesis, before: Model, after: Model) -> bool:
@@ -249,11 +302,19 @@ def _step_without(fit: Fit, left_out: NDArray[np.bool_]) -> Array:
     """Where a fit without some samples would end, by one Gauss-Newton step."""
     assert fit.jacobian is not None and fit.residual is not None
     jacobian = fit.jacobian[~left_out]
-    span = np.array([c.upper - c.lower for c in fit.coordinates])
-    normal = jacobian.T @ jacobian + np.diag(1e-2 / span**2)
+    # Directions that the data hardly see are left alone: there one step leads anywhere.
+    reach = np.array([NOMINAL if c.scale is None else TYPICAL for c in fit.coordinates])
+    normal = jacobian.T @ jacobian + np.diag(1 / reach**2)
     step = np.linalg.solve(normal, jacobian.T @ fit.residual[~left_out])
     low, high = (np.array([getattr(c, e) for c in fit.coordinates]) for e in ("lower", "upper"))
     return np.asarray(np.clip(fit.at + np.clip(step, -0.3, 0.3), low, high))
+
+
+def _linear(fit: Fit, at: Array, inside: NDArray[np.bool_]) -> float:
+    """Chi-squared of some samples at a point, as the Jacobian has it."""
+    assert fit.jacobian is not None and fit.residual is not None
+    told = fit.residual[inside] - fit.jacobian[inside] @ (at - fit.at)
+    return float(told @ told)
 
 
 def _folds(replays: Replays) -> list[list[int]]:

@@ -189,12 +189,12 @@ def distinct(ranking: Sequence[Score], most: int) -> list[Score]:
     return list(best.values())[:most]
 
 
-def rivals(chosen: Round) -> list[Rival]:
-    """The finalists of a round, best first."""
+def rivals(chosen: Round, final: Model | None = None) -> list[Rival]:
+    """The finalists of a round, best first, as seen from what selection ended at."""
     if not chosen.finalists:
         return []
     told = {score.trace.hypothesis: score for score in chosen.ranking}
-    chances, _ = probabilities(chosen.finalists)
+    chances = probabilities(chosen.finalists, final or chosen.finalists[0])
     return [
         Rival(
             told[model.hypotheses[-1]],

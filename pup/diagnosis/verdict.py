@@ -21,7 +21,11 @@ Answer = Literal["mismatch", "none", "undetermined"]
 TEMPERATURE = 4.0
 """Differences of worth are divided by this: models of real data are never quite right."""
 UNKNOWN = 0.03
-"""Probability that a cause outside the library looks like the best inside."""
+"""Probability that a cause outside the library looks like the best inside, and fits as well."""
+BLUR = 0.5
+"""Difference of worth, in what is left, at which rivals count as equals but for a factor of e."""
+DOUBT = 0.2
+"""Where this share of what is to be explained is left, a name is as likely wrong as right."""
 WORTH_SAYING = 0.03
 """Alternatives less probable than this are not told."""
 TWIN = 0.995
@@ -85,11 +89,32 @@ class HeldOut:
     per_motion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def probabilities(models: Sequence[Model]) -> tuple[Array, float]:
-    """Of some rival models by their worth, and what is left for a cause unknown."""
+def probabilities(models: Sequence[Model], final: Model) -> Array:
+    """Of some rival models by their worth, if the cause is known to the library.
+
+    Where the final model leaves more than noise, forms are not quite right, and rivals that leave
+    as much more are as good.
+
+    Args:
+      models: the rivals.
+      final: what selection ended at.
+    """
     worth = np.array([m.worth for m in models])
-    weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE))
-    return (1 - UNKNOWN) * weights / weights.sum(), UNKNOWN
+    weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE + BLUR * left_over(final)))
+    return np.asarray(weights / weights.sum())
+
+
+def left_over(model: Model) -> float:
+    """Chi-squared that a model leaves beyond noise."""
+    return max(model.fit.chi2 - len(model.predicted), 0.0)
+
+
+def doubt(nominal: Model, final: Model) -> float:
+    """Probability that what a model explains has another cause, by what it leaves."""
+    left = left_over(final)
+    explained = max(nominal.fit.chi2 - final.fit.chi2, 1e-9)
+    share = left / (left + explained)
+    return UNKNOWN + (1 - UNKNOWN) * share / (share + DOUBT)
 
 
 def findings(
@@ -116,7 +141,7 @@ def findings(
         assert less.residual is not None and final.fit.residual is not None
         gain = less.residual**2 - final.fit.residual**2
         chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
-        probability, rivals = _rivals(hypothesis, chosen, selector)
+        probability, rivals = _rivals(hypothesis, chosen, selector, final)
         told.append(
             Finding(
                 effect=hypothesis.effect,
@@ -171,11 +196,12 @@ def held_out(measured: Measured, before: Model, after: Model, seed: int) -> Held
 
 
 def _rivals(
-    hypothesis: Hypothesis, chosen: Round, selector: Selector
+    hypothesis: Hypothesis, chosen: Round, selector: Selector, final: Model
 ) -> tuple[float, tuple[Alternative, ...]]:
     """The probability of a finding and of what else it might be."""
     models = list(chosen.finalists)
-    chances, _ = probabilities(models)
+    known = 1 - doubt(selector.nominal, final)
+    chances = known * probabilities(models, final)
     by_key: dict[tuple[str, Place], float] = {}
     for model, chance in zip(models, chances, strict=True):
         key = model.hypotheses[-1].key

@@ -60,6 +60,8 @@ class Servos:
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self._before: Array | None = None
+        self._speed: Array | None = None
+        self._soft: Array | None = None
         self.loaded = any(term.loaded for term in self.flowing)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
@@ -91,10 +93,11 @@ class Servos:
         time = step * self.scene.timestep
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
-        error, torque, damping = self._answer(target.now, sensed, time)
+        ahead = sensed[1] if still else self._ahead(step, sensed[1])
+        error, torque, damping = self._answer(target.now, sensed, ahead, time)
         if target.before is not None:
             share = self._spread(target.share, running)
-            old, was, damped = self._answer(target.before, sensed, time)
+            old, was, damped = self._answer(target.before, sensed, ahead, time)
             error = share * error + (1 - share) * old
             torque = share * torque + (1 - share) * was
             damping = share * damping + (1 - share) * damped
@@ -112,6 +115,26 @@ class Servos:
             torque -= (1 - implicit) * (damping * sensed[1])
             damping *= implicit
         return torque, damping
+
+    def _ahead(self, step: int, velocity: Array) -> Array:
+        """The velocity that damping will meet in a sub-step, if speeds go on changing as they do.
+
+        Whether a servo is at its limit is decided by it: decided by the velocity that is, a servo
+        would leave its limit with a jump of its torque, by what a sub-step changes of the damping,
+        and trajectories would jump with whatever moves that moment past a sub-step's end.
+        """
+        n = len(velocity)
+        gained = np.zeros_like(velocity)
+        if step > 0 and self._speed is not None:
+            np.subtract(velocity, self._speed[:n], out=gained)
+        self._speed = velocity.copy()
+        if self.law.steady:
+            if self._soft is None:
+                damping = self.law.unlimited(velocity, velocity)[1] + self.viscous[:n]
+                self._soft = implicit_share(damping, self.scene.inertia[:n], self.scene.timestep)
+            gained *= self._soft[:n]
+        gained += velocity
+        return gained
 
     def _implicit(self, damping: Array, still: bool) -> Array | None:
         """Share of a damping that the engine takes implicitly; None where it takes all of it."""
@@ -175,7 +198,7 @@ class Servos:
         return full.reshape(running * self.candidates, -1)
 
     def _answer(
-        self, target: Array, sensed: tuple[Array, Array], time: float
+        self, target: Array, sensed: tuple[Array, Array], ahead: Array, time: float
     ) -> tuple[Array, Array, Array]:
         """The law's error, torque and viscous coefficient for one target."""
         position, velocity = sensed
@@ -189,27 +212,27 @@ class Servos:
         torque, damping = self.law.unlimited(error, velocity)
         limit = self.law.limit[: len(error)]
         if not self.driving:
-            _clip(torque, damping, velocity, limit)
+            _clip(torque, damping, ahead, limit)
             return error, torque, damping
         upper = np.broadcast_to(limit, error.shape).copy()
         drive = Drive(time, error, velocity, torque, upper, -upper, np.zeros_like(upper))
         for term in self.driving:
             term.drive(drive)
-        _clip_between(drive, damping)
+        _clip_between(drive, damping, ahead)
         return error, drive.torque, damping
 
 
-def _clip(torque: Array, damping: Array, velocity: Array, limit: Array) -> None:
-    """Clip `torque - damping * velocity` to ±limit, in place; clipped, nothing is left to damp."""
-    total = torque - damping * velocity
+def _clip(torque: Array, damping: Array, ahead: Array, limit: Array) -> None:
+    """Clip `torque - damping * ahead` to ±limit, in place; clipped, nothing is left to damp."""
+    total = torque - damping * ahead
     clipped = ~(np.abs(total) < limit)
     np.copysign(limit, total, out=torque, where=clipped)
     np.copyto(damping, 0.0, where=clipped)
 
 
-def _clip_between(drive: Drive, damping: Array) -> None:
+def _clip_between(drive: Drive, damping: Array, ahead: Array) -> None:
     """The same between two limits of their own; what falls with speed at a limit damps there."""
-    total = drive.torque - damping * drive.velocity
+    total = drive.torque - damping * ahead
     above, below = ~(total < drive.upper), ~(total > drive.lower)
     for limit, beyond in ((drive.upper, above), (drive.lower, below)):
         falls = (limit != 0) & (limit * drive.velocity >= 0)
