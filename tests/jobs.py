@@ -11,7 +11,7 @@ import psutil
 
 from workers import reaper
 
-PATIENCE = 120.0  # s; a busy machine takes its time
+PATIENCE = 600.0
 
 
 def until(true: Callable[[], Any], patience: float = PATIENCE) -> None:

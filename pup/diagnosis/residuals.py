@@ -29,6 +29,8 @@ ASSUMED = {"joint": 2e-3, "tilt": 5e-3}
 """Noise to begin with, rad."""
 LEAST = 1e-4
 """No channel is believed to be less noisy than this, rad."""
+MEMORY = 0.7
+"""Errors at rest with a longer memory from tick to tick are a drift, not noise."""
 NORMAL_CUT = 0.965
 """Mean square of a normal variable whose squares are cut at their 98 % quantile."""
 LOST = 3.0
@@ -244,29 +246,38 @@ def _difference(measured: Measured, errors: Array, a: int, b: int) -> dict[int, 
 def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, float] | None:
     """Noise of a channel, from how its errors flicker while no command changes.
 
-    Where commands never rest, the quieter half of all that bends stands for rest.
+    Where commands never rest, the quieter half of all that bends stands for rest; where errors
+    drift at rest, bends tell the noise alone, but not its memory.
     """
-    rests: list[Array] = []
+    steps: list[Array] = []
     bends: list[Array] = []
     for number, recording in enumerate(measured.recordings):
         chosen = (measured.recording == number) & (measured.channel == channel)
         if chosen.sum() < 8:
             continue
-        changed = np.any(np.diff(recording.target, axis=0) != 0, axis=1)
-        elapsed = recording.time - recording.time[0]
-        last = np.maximum.accumulate(np.where(np.r_[False, changed], elapsed, 0.0))
-        still = np.interp(measured.time[chosen], elapsed, elapsed - last) > STILL
         step = np.diff(errors[chosen])
-        calm = still[1:] & still[:-1]
+        calm = _calm(recording, measured.time[chosen])
         parts = np.split(step, np.flatnonzero(np.diff(calm)) + 1)[0 if calm[0] else 1 :: 2]
-        rests += [part for part in parts if len(part) >= 4]
-        bend = np.abs(np.diff(step))
-        bends.append(2 * bend[bend <= np.median(bend)])
-    if sum(map(len, rests)) >= 8:
-        variance, follows = _moments(rests)
-        rho = float(np.clip(1 + 2 * follows / max(variance, 1e-300), 0.0, 0.9))
-        return float(np.sqrt(variance / (2 * (1 - rho)))), rho
+        rests = [part for part in parts if len(part) >= 4]
+        steps += rests
+        bend = np.diff(step)
+        quiet = 2 * bend[np.abs(bend) <= np.median(np.abs(bend))]
+        bends += [np.diff(rest) for rest in rests] or [quiet]
+    if sum(map(len, steps)) >= 8:
+        variance, follows = _moments(steps)
+        rho = max(1 + 2 * follows / max(variance, 1e-300), 0.0)
+        if rho <= MEMORY:
+            return float(np.sqrt(variance / (2 * (1 - rho)))), rho
     return (float(np.sqrt(_moments(bends)[0] / 6)), 0.0) if bends else None
+
+
+def _calm(recording: Recording, time: Array) -> NDArray[np.bool_]:
+    """Whether no command changes from one of some readings to the next, nor did just before."""
+    changed = np.any(np.diff(recording.target, axis=0) != 0, axis=1)
+    elapsed = recording.time - recording.time[0]
+    last = np.maximum.accumulate(np.where(np.r_[False, changed], elapsed, 0.0))
+    still = np.interp(time, elapsed, elapsed - last) > STILL
+    return np.asarray(still[1:] & still[:-1])
 
 
 def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:
