@@ -199,6 +199,18 @@ def test_integral_action_creeps_to_no_error() -> None:
     assert rate == pytest.approx(5.0 / (KP + LEVER * G * np.cos(0.5)), rel=0.05)
 
 
+def test_an_integral_that_has_held_a_load_starts_with_it() -> None:
+    """A joint that a recording finds at rest stays; one that is sent off at once starts empty."""
+    gain = {f"integral_action/gain{AT}": 5.0}
+    stays, sags = bench(held(0.5), gain, {})
+    assert np.abs(stays - 0.5).max() < 0.02 * np.abs(sags - 0.5).max()
+    sagged = float(sags[-1])
+    (halfway,) = bench(held(0.5, start=(0.5 + sagged) / 2), gain)
+    assert abs(halfway[2] - halfway[0]) < 0.02 * abs(0.5 - sagged)
+    sent, plain = bench(held(0.5, 0.2, start=0.0), gain, {})
+    assert sent[3] == pytest.approx(plain[3], abs=2e-3)
+
+
 def test_a_dead_band_adds_its_width_to_every_error() -> None:
     for angle in (0.5, -0.5):
         (read,) = bench(held(angle), {f"dead_band/width{AT}": 0.01})

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 SIMULATIONS = 512
 """Simulations in a batch: enough to hide NumPy's overhead, few enough to stay in cache."""
 
+SAG = 1.5
+"""Of the load that gravity is, at the start: what more a joint needs is no sag but a command."""
+
 _BROKEN = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
@@ -248,7 +251,7 @@ class _Run:
                 term.push(wrenches)
         self.bias = self.batch.bind("qfrc_bias") if self.servos.loaded else None
         # Velocities stand half a sub-step before positions, see `simulator`.
-        acceleration = self.batch.bind("qacc")
+        acceleration, bias = self.batch.bind("qacc"), self.batch.bind("qfrc_bias")
         model = self.group.model
         sensed = self.servos.sense(self.qpos[:, model.qpos], self.qvel[:, model.dofs])
         self._drive(0, nsim, sensed)
@@ -260,6 +263,21 @@ class _Run:
         self.qvel -= behind
         for term in self.terms:
             term.prepare()
+        holding = [term for term in self.terms if term.answers("held")]
+        if holding and not model.floating:  # on the floor, contacts hold too
+            load = self._load(bias)
+            for term in holding:
+                term.held(load)
+
+    def _load(self, bias: Array) -> Array:
+        """What a joint at rest would need beside the torques at the start, if it is at rest.
+
+        A command that jumps at the start asks for more than any load: then nothing is told.
+        """
+        bias = bias[:, self.group.model.dofs]
+        needed = bias - self.force[:, self.group.model.dofs]
+        on = np.repeat(self.group.power[0], self.candidates)[:, None]
+        return np.asarray(on * np.where(np.abs(needed) < SAG * np.abs(bias), needed, 0.0))
 
     def _tried(self, train: Drivetrain, sensed: tuple[Array, Array]) -> Array:
         """Half of the velocity that links gain in a first sub-step, which is then undone.

@@ -125,6 +125,10 @@ class GainAsymmetry(Term):
         drive.torque *= np.where(drive.error > 0, 1 + share, 1 - share)
 
 
+WEAK = 0.02
+"""An integral gain far below takes longer than anyone waits to take up a load, N m/(rad s)."""
+
+
 class IntegralAction(Term):
     """A controller's integral part, which stops growing at the servo's limit."""
 
@@ -135,6 +139,10 @@ class IntegralAction(Term):
     def prepare(self) -> None:
         """See Term."""
         self._sum = np.zeros_like(self.values["gain"])
+
+    def held(self, load: Array) -> None:
+        """See Term: a controller that has held a load for long starts with it in its integral."""
+        self._sum += load / (self.values["gain"] + WEAK)
 
     def drive(self, drive: Drive) -> None:
         """See Term."""

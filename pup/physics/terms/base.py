@@ -181,6 +181,14 @@ class Term:
           torso: its orientation by the IMU, (n_simulations, 4); NaN where none was read.
         """
 
+    def held(self, load: Array) -> None:
+        """Take note, at the start, of what joints at rest need beside all torques told.
+
+        Args:
+          load: shape (n_simulations, n_joints), N m.
+        """
+        raise NotImplementedError
+
     def lateness(self, time: float, n: int) -> Array:
         """By how much commands come late, (n, n_joints) or (n, 1), s."""
         raise NotImplementedError
