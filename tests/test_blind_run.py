@@ -243,6 +243,12 @@ def test_killed_and_started_again_it_goes_on(quick: Path) -> None:
         job.process.kill()
         assert job.end()[0] in (-signal.SIGKILL, 0)
         job.assert_nothing_left()
+    job = Job(*command(quick), "--cores", 2, out=quick / "out")
+    job.come_to("ray")
+    job.process.terminate()
+    code, out, err = job.end()
+    assert (code, out) == (130, "") and err.endswith("stopped; the same command resumes\n")
+    job.assert_nothing_left()
     last = Job(*command(quick), "--cores", 2, out=quick / "out")
     code, out, err = last.end()
     assert code == 0, err
@@ -254,6 +260,8 @@ def test_killed_and_started_again_it_goes_on(quick: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.ray
+@pytest.mark.timeout(3600)
 def test_made_diagnosed_and_scored(tmp_path: Path) -> None:
     """A set of the generator's, from the first command to the last."""
     counts = ("--robot", "servo_bench=2", "--nulls", "servo_bench=1", "--seed", "try")
@@ -262,7 +270,7 @@ def test_made_diagnosed_and_scored(tmp_path: Path) -> None:
     )
     assert made.code == 0, made.err
     job = Job(*command(tmp_path), "--cores", 2, out=tmp_path / "out")
-    code, _, err = job.end(patience=900)
+    code, _, err = job.end(patience=3600)
     assert code == 0, err
     options = ("--set", tmp_path / "set", "--key", tmp_path / "key.json")
     where = ("--diagnoses", tmp_path / "out", "--out", tmp_path / "scores.json")
