@@ -143,6 +143,7 @@ def test_a_corrected_robot_differs_by_its_parameters_and_terms_alone(tmp_path: P
     assert search["kp/ankle"] == (1.0, 60.0)
     assert robot.network is not None and LEG.network is not None
     assert robot.network.weights[3] == -0.25
+    assert robot.actuator == "pd" != LEG.actuator, "the terms were found beside the PD"
     as_before = replace(
         robot,
         folder=LEG.folder,
@@ -150,6 +151,7 @@ def test_a_corrected_robot_differs_by_its_parameters_and_terms_alone(tmp_path: P
         parameters=LEG.parameters,
         terms=(),
         network=LEG.network,
+        actuator=LEG.actuator,
     )
     assert as_before == LEG
     text = (tmp_path / "leg" / "robot.toml").read_text()

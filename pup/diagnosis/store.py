@@ -5,6 +5,7 @@ before is read instead of simulated.
 """
 
 import hashlib
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,11 +46,9 @@ class Store:
         return run
 
     def clear(self) -> None:
-        """Remove all that is kept."""
-        for file in self.folder.glob("*.f32"):
-            file.unlink()
+        """Remove all that is kept, and what a killed process was writing."""
         if self.folder.is_dir():
-            self.folder.rmdir()
+            shutil.rmtree(self.folder)
 
     def _name(self, batch: Batch) -> str:
         digest = hashlib.sha256(self.digest.encode())
