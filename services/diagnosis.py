@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ DIAGNOSIS = "diagnosis.json"
 CORRECTED = "corrected"
 CHECKPOINTS = "checkpoints"
 """Goes when the diagnosis is done."""
+SPENT = "spent.json"
 
 
 @dataclass(frozen=True)
@@ -76,15 +78,12 @@ def run_diagnosis(
       the first start on; `processor_seconds` too where all was done in this process.
     """
     kept = out / CHECKPOINTS
-    watch = Stopwatch(kept / "spent.json", _digest(robot, recordings))
-
-    def runner(measured: Measured) -> Runner:
-        # Planned recordings are replayed too: what is kept of them is not of those measured.
-        store = Store(kept, _digest(robot, measured.recordings))
-        return watch.around(store.around(where.runner(measured)))
-
+    watch = Stopwatch(kept / SPENT, _digest(robot, recordings))
+    run = keeper(where, robot, kept)
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads, a verdict must not
-        found = diagnose(robot, recordings, runner, where.lanes, progress, seed)
+        found = diagnose(
+            robot, recordings, lambda m: watch.around(run(m)), where.lanes, progress, seed
+        )
     told = document(found, _write_corrected(found, out))
     seconds, processor = watch.spent()
     told |= {"seconds": seconds} | ({"processor_seconds": processor} if where.here else {})
@@ -92,10 +91,30 @@ def run_diagnosis(
     if report:
         progress("report", 0.98)
         write_report(found, out / "report.html", _provenance(robot, recordings, told, seed))
-    watch.clear()
-    Store(kept, "").clear()
+    _clear(kept)
     progress("done", 1.0)
     return told
+
+
+def keeper(where: Where, robot: RobotDescription, kept: Path) -> Callable[[Measured], Runner]:
+    """What runs batches of replays and keeps the answers in a folder."""
+
+    def runner(measured: Measured) -> Runner:
+        # Planned recordings are replayed too, and their answers are not of those measured.
+        store = Store(kept, _digest(robot, measured.recordings))
+        return store.around(where.runner(measured))
+
+    return runner
+
+
+def _clear(kept: Path) -> None:
+    """Remove what a diagnosis keeps while it lasts, but nothing of another job's."""
+    # Who is killed while writing leaves a file whose name begins with a dot.
+    for pattern in ("*.f32", ".*.f32.*", SPENT, f".{SPENT}.*"):
+        for file in kept.glob(pattern):
+            file.unlink()
+    with suppress(OSError):  # it holds something else, or never was
+        kept.rmdir()
 
 
 def _write_corrected(found: Diagnosis, out: Path) -> str:

@@ -51,10 +51,6 @@ class Stopwatch:
 
         return run
 
-    def clear(self) -> None:
-        """Forget what is kept."""
-        self.file.unlink(missing_ok=True)
-
     def _kept(self) -> tuple[float, float]:
         with suppress(InputError, KeyError, TypeError, ValueError):  # a torn file counts as none
             told = read_json(self.file)

@@ -2,15 +2,23 @@
 
 import json
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from blind_sets import FRICTION, motions
+from blind_sets import FRICTION, motions, poor
 from commandline import pup
+from diagnosis_cases import BENCH
 from jobs import Job
+from numpy.typing import NDArray
 
+from pup.diagnosis.replays import Batch, Bench, Replays, Runner, threads
+from pup.diagnosis.residuals import Measured
+from pup.physics.parameters import robot_space
 from pup.recording import write_recordings
+from services.diagnosis import Where, alone, keeper, run_diagnosis
 from services.stopwatch import Stopwatch
 
 STOPPED = "pup diagnose: stopped; the same command resumes\n"
@@ -74,6 +82,7 @@ def test_killed_again_and_again(runs: Path, tmp_path: Path, wanted: Path) -> Non
     spent = Stopwatch(tmp_path / "checkpoints" / "spent.json", "of another job")
     assert spent.before == (0.0, 0.0)
     before = json.loads(spent.file.read_text())["spent"]
+    (tmp_path / "checkpoints" / ".half.f32.written").touch()  # what a kill may leave
     code, _, err = diagnose(runs, tmp_path, "--local", "--cores", 1).end()
     assert code == 0, err
     assert_same(tmp_path, wanted)
@@ -110,3 +119,34 @@ def test_killed_on_ray_and_stopped(runs: Path, tmp_path: Path, wanted: Path) -> 
     code, _, err = diagnose(runs, tmp_path, *RAY).end()
     assert code == 0, err
     assert_same(tmp_path, wanted)
+
+
+def test_checkpoints_of_another_job_are_left(tmp_path: Path) -> None:
+    """`pup presysid` may keep its own in the same folder."""
+    kept = tmp_path / "checkpoints"
+    kept.mkdir()
+    (kept / "nominal.npz").touch()
+    run_diagnosis(BENCH, poor(1), tmp_path, alone(1), lambda stage, share: None, report=False)
+    assert [file.name for file in kept.iterdir()] == ["nominal.npz"]
+
+
+def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path) -> None:
+    """Two sets of recordings under the same parameters are two questions."""
+    asked: list[int] = []
+
+    def runner(measured: Measured) -> Runner:
+        def run(batches: Sequence[Batch]) -> list[NDArray[np.float64]]:
+            asked.append(len(batches))
+            return threads(Bench(measured), 1)(batches)
+
+        return run
+
+    kept = keeper(Where(runner, 1, here=True), BENCH, tmp_path)
+    answers = []
+    for runs in (poor(1), poor(2), poor(1)):
+        measured = Measured.of(BENCH, runs)
+        replays = Replays(measured, robot_space(BENCH, "pd"), kept(measured), 1)
+        answers.append(replays([{"kp/servo": 3.0}])[0])
+    assert asked == [1, 1, 0]
+    assert np.array_equal(answers[0], answers[2])
+    assert not np.array_equal(answers[0], answers[1])
