@@ -33,11 +33,6 @@ def assert_recovered(bounds, truth):
     assert not missed, {n: (truth[n], bounds.document()["parameters"]) for n in missed}
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="open: the knee's torque limit ends at [2.35, 2.39] for a true 2.3 N m, 0.9 % of its "
-    "range off, since servos decide on their limit by the speed ahead",
-)
 def test_servo_gains_of_a_leg_are_recovered(tmp_path: Path) -> None:
     """Suspended steps tell stiffness, damping and torque limit of each group."""
     space = robot_space(RobotDescription.load("darwin_leg"), "pd")

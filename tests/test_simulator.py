@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import ParameterSpace, robot_space
 from pup.physics.simulator import Trajectories
-from pup.recording import Recording
+from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
@@ -362,3 +362,19 @@ def test_two_milliseconds_are_fine_enough() -> None:
         for robot in (leg, fine)
     )
     assert np.sqrt(np.mean((ours.position - finer.position) ** 2)) < 3e-4
+
+
+def test_stiff_servos_near_their_limit_move_as_with_fine_substeps() -> None:
+    """Damping that stops a light link within a sub-step must not make its servo chatter."""
+    run = load_recordings([OP2.model_path.parent / "recordings" / "step_0.6_0.parquet"])
+    gains = {"arm": (11, 0.95, 3.4), "head": (13, 0.95, 2.1), "hip": (20, 1.5, 6.0)}
+    gains |= {"knee": (22, 1.7, 6.0), "ankle": (14, 1.1, 4.4)}
+    values = {"armature": 5e-4}
+    for group, told in gains.items():
+        values |= {
+            f"{k}/{group}": float(v) for k, v in zip(("kp", "kd", "tau_max"), told, strict=True)
+        }
+    coarse, fine = (
+        replay(replace(OP2, timestep=step), run, values).position for step in (STEP, STEP / 8)
+    )
+    assert np.sqrt(np.mean((coarse - fine) ** 2)) < 1e-3

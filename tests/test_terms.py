@@ -147,7 +147,7 @@ def test_replays_depend_continuously_on_every_size() -> None:
     seen = play(LEG, AIR["darwin_leg"], rows).position
     change = np.sqrt(np.mean((seen[1:] - seen[0]) ** 2, axis=(1, 2))).reshape(-1, 3)
     for effect, (tiny, half, full) in zip(IN_THE_AIR, change, strict=True):
-        assert tiny < (4e-5 if effect in DRIVETRAIN else 2e-5), effect
+        assert tiny < (8e-5 if effect in DRIVETRAIN else 2e-5), effect
         # Play of another width is met at other times: half of it may do more.
         assert 0.3 < half / full < 0.7 or effect == "backlash", effect
 

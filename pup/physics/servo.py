@@ -60,8 +60,15 @@ class Servos:
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self._before: Array | None = None
-        self._speed: Array | None = None
-        self._soft: Array | None = None
+        self._last: tuple[Array, Array, Array] | None = None
+        self._inertia = scene.inertia / scene.timestep
+        still = np.zeros_like(scene.inertia)
+        self._share = np.ones_like(still)
+        if law.steady:
+            own = law.unlimited(still, still)[1]
+            self._share = implicit_share(own, scene.inertia, scene.timestep)
+            self._free, self._held = self._damped(own), self._damped(still)
+        self._reach = self._share / self._inertia
         self.loaded = any(term.loaded for term in self.flowing)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
@@ -93,11 +100,11 @@ class Servos:
         time = step * self.scene.timestep
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
-        ahead = sensed[1] if still else self._ahead(step, sensed[1])
-        error, torque, damping = self._answer(target.now, sensed, ahead, time)
+        outside = None if still else self._outside(step, sensed[1])
+        error, torque, damping = self._answer(target.now, sensed, outside, time)
         if target.before is not None:
             share = self._spread(target.share, running)
-            old, was, damped = self._answer(target.before, sensed, ahead, time)
+            old, was, damped = self._answer(target.before, sensed, outside, time)
             error = share * error + (1 - share) * old
             torque = share * torque + (1 - share) * was
             damping = share * damping + (1 - share) * damped
@@ -105,36 +112,61 @@ class Servos:
             on = np.repeat(self.power[step, :running], self.candidates)[:, None]
             torque *= on
             damping *= on
+        if not still:
+            self._last = sensed[1].copy(), torque, damping
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
         if self.flowing:
             return self._through_gears(step, link, sensed[1], bias, (torque, damping), still)
-        damping += self.viscous[: len(damping)]
+        damping = damping + self.viscous[: len(damping)]
         implicit = self._implicit(damping, still)
         if implicit is not None:
-            torque -= (1 - implicit) * (damping * sensed[1])
+            torque = torque - (1 - implicit) * (damping * sensed[1])
             damping *= implicit
         return torque, damping
 
-    def _ahead(self, step: int, velocity: Array) -> Array:
-        """The velocity that damping will meet in a sub-step, if speeds go on changing as they do.
-
-        Whether a servo is at its limit is decided by it: decided by the velocity that is, a servo
-        would leave its limit with a jump of its torque, by what a sub-step changes of the damping,
-        and trajectories would jump with whatever moves that moment past a sub-step's end.
-        """
+    def _outside(self, step: int, velocity: Array) -> Array | None:
+        """Torque beside the servos', N m, by what the last sub-step did; None before the first."""
+        if step == 0 or self._last is None:
+            return None
         n = len(velocity)
-        gained = np.zeros_like(velocity)
-        if step > 0 and self._speed is not None:
-            np.subtract(velocity, self._speed[:n], out=gained)
-        self._speed = velocity.copy()
+        before, torque, damping = (a[:n] for a in self._last)
+        gained = velocity - before
+        met = velocity  # by what is taken implicitly
         if self.law.steady:
-            if self._soft is None:
-                damping = self.law.unlimited(velocity, velocity)[1] + self.viscous[:n]
-                self._soft = implicit_share(damping, self.scene.inertia[:n], self.scene.timestep)
-            gained *= self._soft[:n]
-        gained += velocity
+            met = gained * self._share[:n]
+            met += before
+        braked = damping * met
+        gained *= self._inertia[:n]
+        gained += braked
+        gained -= torque
         return gained
+
+    def _ahead(
+        self, torque: Array, damping: Array, velocity: Array, outside: Array | None
+    ) -> Array:
+        """The velocity that damping meets in a sub-step, by each joint's own inertia.
+
+        Whether a servo is at its limit is decided by it. Decided by the velocity that is, a servo
+        would leave its limit with a jump of its torque, by what a sub-step changes of the damping,
+        and trajectories would jump with whatever moves that moment past a sub-step's end. Stiff
+        damping brakes within the sub-step: velocities that only go on as they did would mislead.
+        """
+        if outside is None:
+            return velocity
+        reach = self._reach[: len(velocity)]
+        ahead = torque + outside
+        ahead *= reach
+        ahead += velocity
+        slower = reach * damping
+        slower += 1
+        ahead /= slower
+        return ahead
+
+    def _damped(self, servo: Array) -> tuple[Array, Array]:
+        """All damping with some of the servos, and the share that a sub-step takes implicitly."""
+        total = servo + self.viscous
+        return total, implicit_share(total, self.scene.inertia, self.scene.timestep)
 
     def _implicit(self, damping: Array, still: bool) -> Array | None:
         """Share of a damping that the engine takes implicitly; None where it takes all of it."""
@@ -142,7 +174,12 @@ class Servos:
             return np.zeros_like(damping)
         if not self.law.steady:
             return None
-        return implicit_share(damping, self.scene.inertia[: len(damping)], self.scene.timestep)
+        n = len(damping)
+        free, held = self._free[0][:n], self._held[0][:n]
+        off_limit = damping == free
+        if (off_limit | (damping == held)).all():  # as it mostly is, without exponentials
+            return np.where(off_limit, self._free[1][:n], self._held[1][:n])
+        return implicit_share(damping, self.scene.inertia[:n], self.scene.timestep)
 
     def _through_gears(
         self,
@@ -154,7 +191,7 @@ class Servos:
         still: bool,
     ) -> tuple[Array, Array]:
         """What of the torque and damping of a servo reaches the links; see `torque`."""
-        torque, damping = driven
+        torque, damping = (a.copy() for a in driven)  # gears change them in place
         viscous, brake = self.viscous[: len(damping)], np.zeros_like(torque)
         share = self._implicit(damping + viscous, still)
         if share is not None:
@@ -198,7 +235,7 @@ class Servos:
         return full.reshape(running * self.candidates, -1)
 
     def _answer(
-        self, target: Array, sensed: tuple[Array, Array], ahead: Array, time: float
+        self, target: Array, sensed: tuple[Array, Array], outside: Array | None, time: float
     ) -> tuple[Array, Array, Array]:
         """The law's error, torque and viscous coefficient for one target."""
         position, velocity = sensed
@@ -212,13 +249,13 @@ class Servos:
         torque, damping = self.law.unlimited(error, velocity)
         limit = self.law.limit[: len(error)]
         if not self.driving:
-            _clip(torque, damping, ahead, limit)
+            _clip(torque, damping, self._ahead(torque, damping, velocity, outside), limit)
             return error, torque, damping
         upper = np.broadcast_to(limit, error.shape).copy()
         drive = Drive(time, error, velocity, torque, upper, -upper, np.zeros_like(upper))
         for term in self.driving:
             term.drive(drive)
-        _clip_between(drive, damping, ahead)
+        _clip_between(drive, damping, self._ahead(drive.torque, damping, velocity, outside))
         return error, drive.torque, damping
 
 
