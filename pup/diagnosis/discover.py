@@ -249,11 +249,16 @@ def _kept(
     fits = [law.started(model.fit, place) for law in tried]
     fit_together(fits, selector.replays, selector.noise, iterations=ITERATIONS)
     kept: list[tuple[float, Law, Model]] = []
-    for law, fit in zip(tried, fits, strict=True):
+    gained = [
+        (law, fit)
+        for law, fit in zip(tried, fits, strict=True)
+        if model.fit.chi2 - fit.chi2 > selector.enough
+    ]
+    if not gained:
+        return []
+    corrected = selector.models([(model.hypotheses, fit) for _, fit in gained])
+    for (law, fit), after in zip(gained, corrected, strict=True):
         inside = model.fit.chi2 - fit.chi2
-        if inside <= selector.enough:
-            continue
-        after = selector.model(model.hypotheses, fit)
         deviation = np.sqrt(np.diag(fit.covariance()))[-len(law.features) :]
         if (np.abs(fit.at[-len(law.features) :]) < BAND * deviation).any():
             continue  # a part of it is not needed

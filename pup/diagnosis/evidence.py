@@ -1,9 +1,9 @@
 """The score test: which effect, at which place, the nominal fit's errors look like.
 
-A hypothesis is simulated once, at a moderate size; what the nominal parameters can imitate of its
-trace is projected out of it; what is left is matched with the errors (a Lagrange-multiplier test).
-Matched filters find traces far below the noise. How large the largest of so many scores becomes by
-chance follows from the traces alone.
+A hypothesis is simulated once, at a moderate size, joint by joint where it is of several; what the
+nominal parameters can imitate of its trace is projected out of it; what is left is matched with the
+errors (a Lagrange-multiplier test). Matched filters find traces far below the noise. How large the
+largest of so many scores becomes by chance follows from the traces alone.
 """
 
 from collections.abc import Sequence
@@ -18,6 +18,7 @@ from pup.diagnosis.hypotheses import MODERATE, Hypothesis
 from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
+from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 
@@ -110,23 +111,44 @@ def traces(
       noise: weighs the samples.
     """
     assert base.jacobian is not None
-    probes = [probe for h in hypotheses for probe in h.probes()]
+    alone, sums = _split(hypotheses, replays.measured.robot)
+    probes = [probe for h in alone for probe in h.probes()]
     changed = replays.measured.whiten(changes([(base.row(), probes)], replays)[0], noise)
-    project = Projector(base.jacobian)
-    out, next_row = [], 0
-    for hypothesis in hypotheses:
+    wholes: dict[Hypothesis, Array] = {}
+    next_row = 0
+    for hypothesis in alone:
         count = len(hypothesis.magnitudes)
-        part = changed[next_row : next_row + count].T
+        wholes[hypothesis] = changed[next_row : next_row + count].T / MODERATE
         next_row += count
-        trace = _trace(hypothesis, part, project)
-        if trace is not None:
-            out.append(trace)
-    return out
+    for hypothesis, members in sums.items():
+        wholes[hypothesis] = np.sum([wholes[h] for h in members], axis=0)
+    project = Projector(base.jacobian)
+    told = (_trace(h, wholes[h], project) for h in hypotheses)
+    return [trace for trace in told if trace is not None]
 
 
-def _trace(hypothesis: Hypothesis, change: Array, project: Projector) -> Trace | None:
+def _split(
+    hypotheses: Sequence[Hypothesis], robot: RobotDescription
+) -> tuple[list[Hypothesis], dict[Hypothesis, list[Hypothesis]]]:
+    """Those to simulate, and those of several joints, whose traces are the sums of each joint's."""
+    at_joints = {(h.effect, h.place.name, h.form): h for h in hypotheses if h.place.kind == "joint"}
+    alone: list[Hypothesis] = []
+    sums: dict[Hypothesis, list[Hypothesis]] = {}
+    for hypothesis in hypotheses:
+        members = [
+            at_joints.get((hypothesis.effect, robot.joint_names[i], hypothesis.form))
+            for i in hypothesis.place.joints(robot)
+        ]
+        known = [m for m in members if m is not None]
+        if hypothesis.place.kind == "joint" or not members or len(known) < len(members):
+            alone.append(hypothesis)
+        else:
+            sums[hypothesis] = known
+    return alone, sums
+
+
+def _trace(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | None:
     """The trace of a hypothesis; None where the data cannot show it."""
-    whole = change / MODERATE
     return _seen(hypothesis, whole, project) if np.isfinite(whole).all() else None
 
 

@@ -22,13 +22,15 @@ Array = NDArray[np.float64]
 
 STEP = 0.004
 """Finite-difference step, of a coordinate."""
-DAMPINGS = (0.1, 1.0, 10.0)
+DAMPINGS = (0.1, 3.0)
 """Tried at once, relative to the current one."""
 ENOUGH = 0.05
 """A fit has ended when no step lowers chi-squared by as much."""
 ALMOST = 1e-9
 CHEAP = 100
 """Simulations that a replay may have beside those it needs, for Jacobians of its trials."""
+RELIABLE = 0.5
+"""Share of what it promised that a step must gain for its Jacobian to be kept."""
 PATIENCE = 2
 """Accepted steps for which an updated Jacobian is trusted."""
 
@@ -105,6 +107,7 @@ class Fit:
       damping: of Levenberg and Marquardt.
       age: steps since the Jacobian was fresh.
       width: of its finite differences, in their usual one.
+      slack: relative gain of chi-squared below which it has ended.
       stuck: times in a row that no trial was better.
     """
 
@@ -122,6 +125,12 @@ class Fit:
     age: int = 0
     stuck: int = 0
     width: float = 1.0
+    slack: float = 1e-5
+
+    @property
+    def least(self) -> float:
+        """Gain of chi-squared that counts."""
+        return max(ENOUGH, self.slack * self.chi2)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,10 +171,10 @@ def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations
     """
     _begin([fit for fit in fits if fit.residual is None], replays, noise)
     for _ in range(iterations):
+        _look_around([fit for fit in fits if not fit.done], replays, noise)
         moving = [fit for fit in fits if not fit.done]
         if not moving:
             return
-        differentiate([fit for fit in moving if fit.jacobian is None], replays, noise)
         trials = [(fit, at) for fit in moving for at in _trials(fit)]
         reached = _reached(trials, replays, noise)
         for fit in moving:
@@ -173,6 +182,19 @@ def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations
                 fit,
                 [told for (owner, _), told in zip(trials, reached, strict=True) if owner is fit],
             )
+
+
+def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Give fits the Jacobians they need for a step; those that one promises nothing have ended."""
+    differentiate([fit for fit in fits if fit.jacobian is None], replays, noise)
+    differentiate([f for f in fits if f.thorough and f.age > 0 and _ended(f)], replays, noise)
+    for fit in fits:
+        fit.done = _ended(fit)
+
+
+def _ended(fit: Fit) -> bool:
+    """Whether the Jacobian promises no gain that counts."""
+    return _promise(fit, _trials(fit)[0]) < fit.least
 
 
 def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
@@ -256,20 +278,32 @@ def _step(fit: Fit, i: int, at: Array) -> float:
 
 
 def _trials(fit: Fit) -> list[Array]:
-    """Where damped Gauss-Newton steps lead."""
-    assert fit.jacobian is not None and fit.residual is not None
-    weight = 1.0 if fit.weight is None else fit.weight[:, None]
-    jacobian = fit.jacobian * weight
-    residual = fit.residual if fit.weight is None else fit.residual * fit.weight
+    """Where damped Gauss-Newton steps lead, the least damped first."""
+    normal, gradient = _normal(fit)
     lower = np.array([c.lower for c in fit.coordinates])
     upper = np.array([c.upper for c in fit.coordinates])
-    normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
     scale = np.maximum(np.diag(normal), 1e-6 * max(float(np.diag(normal).max()), 1e-300))
     points = []
     for factor in DAMPINGS:
         system = normal + factor * fit.damping * np.diag(scale)
         points.append(_bounded(system, gradient, fit.at, lower, upper))
     return points
+
+
+def _normal(fit: Fit) -> tuple[Array, Array]:
+    """The normal matrix, and half of chi-squared's slope downhill."""
+    assert fit.jacobian is not None and fit.residual is not None
+    if fit.weight is None:
+        return fit.jacobian.T @ fit.jacobian, fit.jacobian.T @ fit.residual
+    jacobian = fit.jacobian * fit.weight[:, None]
+    return jacobian.T @ jacobian, jacobian.T @ (fit.residual * fit.weight)
+
+
+def _promise(fit: Fit, to: Array) -> float:
+    """Gain of chi-squared at a point, as the Jacobian has it."""
+    normal, gradient = _normal(fit)
+    step = to - fit.at
+    return float(2 * gradient @ step - step @ normal @ step)
 
 
 def _bounded(system: Array, gradient: Array, at: Array, lower: Array, upper: Array) -> Array:
@@ -303,14 +337,14 @@ def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
     """Go where a trial is best, or ask for a fresh Jacobian, or stop."""
     costs = [_chi2(fit, told.residual) for told in reached]
     best = int(np.argmin(costs))
-    gain = fit.chi2 - costs[best]
-    fresh = fit.age == 0
+    gain, fresh = fit.chi2 - costs[best], fit.age == 0
+    kept = gain > RELIABLE * _promise(fit, reached[best].at)
     if gain > 0:
         _go(fit, reached[best], costs[best])
         fit.damping = float(np.clip(fit.damping * DAMPINGS[best], 1e-6, 1e6))
         fit.stuck = 0
-    if gain > max(ENOUGH, 1e-5 * fit.chi2):
-        if fit.age >= PATIENCE and fit.thorough:
+    if gain > fit.least:
+        if fit.thorough and fit.age > 0 and (fit.age >= PATIENCE or not kept):
             fit.jacobian = None
     elif gain <= 0 and fit.stuck < 2:
         fit.damping *= 30

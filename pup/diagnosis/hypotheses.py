@@ -45,6 +45,11 @@ class Hypothesis:
         """What it claims, whatever its shape."""
         return self.effect, self.place
 
+    @property
+    def form(self) -> tuple[float, ...]:
+        """Values of its shape quantities."""
+        return tuple(value for _, value in self.shape)
+
     @cached_property
     def magnitudes(self) -> tuple[str, ...]:
         """Columns that are zero where it is absent."""

@@ -23,6 +23,8 @@ SPREAD = 0.35
 AGREEMENT = 3e-3
 """Two starts agree in chi-squared to this share of it, or to ABSOLUTE."""
 ABSOLUTE = 5.0
+ROUGH = 2e-3
+"""Relative gain of chi-squared at which the starts may end: all that follows is the noise floor."""
 WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
 """Widths of finite differences with which starts that disagree are taken further."""
 SELF = 3.0
@@ -124,7 +126,7 @@ def _start(
         for c in coordinates
     ]
     low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
-    return Fit(tuple(coordinates), np.clip(at, low, high), thorough=False)
+    return Fit(tuple(coordinates), np.clip(at, low, high), slack=ROUGH)
 
 
 def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator) -> float:

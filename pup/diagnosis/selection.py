@@ -25,8 +25,10 @@ FINALISTS = 8
 """Hypotheses refitted in each round."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
-ROUGH = 5
-"""Steps in which finalists are compared."""
+FIRST, ROUGH = 2, 5
+"""Steps after which finalists are compared for the first time, and in which they are."""
+HOPE = 0.5
+"""Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
 MOST = 8
@@ -80,14 +82,19 @@ class Round:
     Attributes:
       before: the model it was added to.
       ranking: what the score test said, best first.
-      finalists: the models refitted, best first.
-      accepted: whether the first of them was added.
+      finalists: the models refitted, best first: those that hold, then the others.
+      holding: how many of them hold; with any, the first was added.
     """
 
     before: Model
     ranking: tuple[Score, ...]
     finalists: tuple[Model, ...]
-    accepted: bool
+    holding: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether an effect was added."""
+        return self.holding > 0
 
     @property
     def chosen(self) -> Hypothesis:
@@ -137,7 +144,7 @@ class Selector:
 
     def model(self, hypotheses: Sequence[Hypothesis], fit: Fit) -> Model:
         """A fitted model with its predictions of the folds."""
-        return self._held_out([(tuple(hypotheses), fit)])[0]
+        return self.models([(tuple(hypotheses), fit)])[0]
 
     def without(self, model: Model, hypothesis: Hypothesis) -> Fit:
         """The model refitted without one of its effects."""
@@ -155,12 +162,14 @@ class Selector:
             return None
         shortlist = _shortlist(ranking, self.enough)
         tried = [self._started(model, score) for score in shortlist]
-        self._refit([fit for _, fit in tried])
+        self._refit([fit for _, fit in tried], fit.chi2)
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
-            return Round(model, tuple(ranking), (), False)
-        finalists = sorted(self._held_out(better), key=lambda m: m.worth)
-        return Round(model, tuple(ranking), tuple(finalists), self._holds(model, finalists[0]))
+            return Round(model, tuple(ranking), (), 0)
+        finalists = sorted(self.models(better), key=lambda m: m.worth)
+        holds = [m for m in finalists if self._holds(model, m)]
+        others = [m for m in finalists if m not in holds]
+        return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
     def _second(self, before: Model, after: Model) -> bool:
         """Whether an effect is more than what is wrong in the forms of those at its joints."""
@@ -177,9 +186,12 @@ class Selector:
         """Chi-squared that wrong forms of a model's effects may leave."""
         return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
 
-    def _refit(self, fits: Sequence[Fit]) -> None:
-        """Refit finalists, all of them roughly and the best of them to the end."""
-        fit_together(fits, self.replays, self.noise, iterations=ROUGH)
+    def _refit(self, fits: Sequence[Fit], start: float) -> None:
+        """Refit finalists: all for a first look, the promising roughly, the best to the end."""
+        fit_together(fits, self.replays, self.noise, iterations=FIRST)
+        seen = min(fit.chi2 for fit in fits)
+        promising = [fit for fit in fits if fit.chi2 - seen < HOPE * (start - seen) + MARGIN]
+        fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
         best = sorted(fits, key=lambda fit: fit.chi2)[:CLOSE]
         close = [fit for fit in best if fit.chi2 < 1.02 * best[0].chi2 + MARGIN]
         for fit in close:
@@ -242,8 +254,8 @@ class Selector:
         fixed = {n: v for n, v in model.fit.fixed.items() if n not in gone}
         return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed, thorough=False)
 
-    def _held_out(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
-        """Models with the predictions of fits without each fold.
+    def models(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
+        """Fitted models with the predictions of fits without each fold.
 
         A fit without a fold starts where the whole fit ends, and takes one Gauss-Newton step. A
         long one, along what the other folds hardly see, leaves the valley that a fit would follow:
@@ -280,12 +292,8 @@ class Selector:
 def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
     """The channels of the joints at a place; all channels where it is none of some joints."""
     chosen = np.zeros(len(robot.joints) + 2, dtype=bool)
-    if place.kind == "joint":
-        chosen[robot.joint_names.index(place.name)] = True
-    elif place.kind == "group":
-        chosen[:-2] = robot.group_index == robot.groups.index(place.name)
-    else:
-        chosen[:] = True
+    joints = place.joints(robot)
+    chosen[joints if place.kind in ("joint", "group") else slice(None)] = True
     return chosen
 
 

@@ -194,7 +194,9 @@ def rivals(chosen: Round, final: Model | None = None) -> list[Rival]:
     if not chosen.finalists:
         return []
     told = {score.trace.hypothesis: score for score in chosen.ranking}
-    chances = probabilities(chosen.finalists, final or chosen.finalists[0])
+    likely = chosen.finalists[: chosen.holding or None]
+    chances = np.zeros(len(chosen.finalists))
+    chances[: len(likely)] = probabilities(likely, final or chosen.finalists[0])
     return [
         Rival(
             told[model.hypotheses[-1]],
@@ -212,6 +214,8 @@ def why_behind(rival: Rival, best: Rival) -> str:
     same = overlap(rival.score.trace, best.score.trace)
     if rival.outside <= KEPT * rival.inside:
         return "fits these motions but does not predict others"
+    if rival.probability == 0:
+        return "explains too little of what is left to be more than a wrong form of the others"
     if rival.probability >= WORTH_SAYING:
         return f"hardly to be told apart: {100 * same:.0f} % the same trace"
     if rival.outside >= SAME * best.outside:

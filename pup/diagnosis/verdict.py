@@ -199,7 +199,7 @@ def _rivals(
     hypothesis: Hypothesis, chosen: Round, selector: Selector, final: Model
 ) -> tuple[float, tuple[Alternative, ...]]:
     """The probability of a finding and of what else it might be."""
-    models = list(chosen.finalists)
+    models = chosen.finalists[: chosen.holding]
     known = 1 - doubt(selector.nominal, final)
     chances = known * probabilities(models, final)
     by_key: dict[tuple[str, Place], float] = {}

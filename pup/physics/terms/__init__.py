@@ -158,6 +158,14 @@ class Place:
             raise InputError(f"place {text!r}: {kind!r} is none of {', '.join(get_args(Kind))}")
         return cls(kind, name)  # type: ignore[arg-type]
 
+    def joints(self, robot: RobotDescription) -> NDArray[np.int64]:
+        """The joints of a joint, of a group, or of a whole robot or bus; none elsewhere."""
+        if self.kind == "joint":
+            return np.array([robot.joint_names.index(self.name)])
+        if self.kind == "group":
+            return np.flatnonzero(robot.group_index == robot.groups.index(self.name))
+        return np.arange(len(robot.joints) if self.kind in ("robot", "bus") else 0)
+
 
 def column(effect: str, quantity: str, place: Place) -> str:
     """Name of a column of candidates."""
@@ -299,10 +307,8 @@ def _where(term: type[Term], place: Place, scene: Scene) -> NDArray[np.int64]:
         raise InputError(f"place {place}: the robot has no {place.kind} of that name")
     if term.layout == "one":
         return np.zeros(1, dtype=np.int64)
-    if place.kind == "joint":
-        return np.array([robot.joint_names.index(place.name)])
-    if place.kind == "group":
-        return np.flatnonzero(robot.group_index == robot.groups.index(place.name))
+    if place.kind in ("joint", "group"):
+        return place.joints(robot)
     if place.kind == "foot":
         return np.array([robot.feet.index(place.name)])
     if place.kind == "body":
