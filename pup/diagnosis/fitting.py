@@ -22,9 +22,9 @@ Array = NDArray[np.float64]
 
 STEP = 0.004
 """Finite-difference step, of a coordinate."""
-DAMPINGS = (0.1, 3.0)
-"""Tried at once, relative to the current one."""
-ENOUGH = 0.05
+DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
+"""Tried at once, relative to the current one: at first, and where that led nowhere."""
+ENOUGH = 0.2
 """A fit has ended when no step lowers chi-squared by as much."""
 ALMOST = 1e-9
 CHEAP = 100
@@ -284,10 +284,14 @@ def _trials(fit: Fit) -> list[Array]:
     upper = np.array([c.upper for c in fit.coordinates])
     scale = np.maximum(np.diag(normal), 1e-6 * max(float(np.diag(normal).max()), 1e-300))
     points = []
-    for factor in DAMPINGS:
+    for factor in _dampings(fit):
         system = normal + factor * fit.damping * np.diag(scale)
         points.append(_bounded(system, gradient, fit.at, lower, upper))
     return points
+
+
+def _dampings(fit: Fit) -> tuple[float, ...]:
+    return HEAVIER if fit.stuck else DAMPINGS
 
 
 def _normal(fit: Fit) -> tuple[Array, Array]:
@@ -341,13 +345,13 @@ def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
     kept = gain > RELIABLE * _promise(fit, reached[best].at)
     if gain > 0:
         _go(fit, reached[best], costs[best])
-        fit.damping = float(np.clip(fit.damping * DAMPINGS[best], 1e-6, 1e6))
+        fit.damping = float(np.clip(fit.damping * _dampings(fit)[best], 1e-6, 1e6))
         fit.stuck = 0
     if gain > fit.least:
         if fit.thorough and fit.age > 0 and (fit.age >= PATIENCE or not kept):
             fit.jacobian = None
     elif gain <= 0 and fit.stuck < 2:
-        fit.damping *= 30
+        fit.damping *= 10 if fit.stuck == 0 else 1000
         fit.stuck += 1
     elif fresh or not fit.thorough:
         fit.done = True

@@ -27,6 +27,8 @@ WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
 FIRST, ROUGH = 2, 5
 """Steps after which finalists are compared for the first time, and in which they are."""
+ROUGHLY = 1e-3
+"""Relative gain of chi-squared at which a finalist's fit may end."""
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
@@ -222,6 +224,7 @@ class Selector:
             np.r_[model.fit.at, np.clip(start, low, high)],
             fixed={**model.fit.fixed, **{n: v for n, v in shape.items() if n not in free}},
             thorough=False,
+            slack=ROUGHLY,
         )
         if not hypothesis.continuous:  # the traces are the Jacobian's columns
             assert model.fit.jacobian is not None
