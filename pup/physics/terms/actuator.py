@@ -172,37 +172,55 @@ class DeadBand(Term):
 
 
 class TargetRateLimit(Term):
-    """The controller's goal moves at most at some speed towards the command."""
+    """The controller's goal moves at most at some speed towards the command.
+
+    It takes up and leaves that speed gradually, as servos with a profile acceleration do.
+    """
 
     effect = "target_rate_limit"
     kinds = ("joint", "group", "bus")
-    quantities = (Quantity("slowness", "s/rad", 0.25, 2.0),)
-    source = "3 to 5 rad/s; BAM (arXiv:2410.08650) has it in the STS3215"
+    quantities = (
+        Quantity("slowness", "s/rad", 0.25, 2.0),
+        Quantity("ramp", "s", 0.02, 1.0, grid=(0.02,)),
+    )
+    source = "3 to 5 rad/s; BAM (arXiv:2410.08650) has it in the STS3215; ramps: an estimate"
 
     def prepare(self) -> None:
         """See Term."""
-        slowness = self.values["slowness"]
-        self._reach = self.scene.timestep / np.maximum(slowness, 1e-9)
+        slowness = np.maximum(self.values["slowness"], 1e-9)
+        self._rate = 1 / slowness
+        self._acceleration = self._rate / self.values["ramp"]
         self._goal: Array | None = None
+        self._speed = np.zeros_like(slowness)
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term."""
         n = len(now)
         if self._goal is None:
             self._goal = before.copy()
-        goal, reach = self._goal[:n], self._reach[:n]
         limited = self.values["slowness"][:n] > 0
-        earlier = _moved(goal, before, reach * (1 - share))
-        later = _moved(goal, now, reach * share)
+        earlier = self._moved(before, self.scene.timestep * (1 - share))
+        later = self._moved(now, self.scene.timestep * share)
         return np.where(limited, later, now), np.where(limited, earlier, before)
 
-
-def _moved(goal: Array, target: Array, reach: Array) -> Array:
-    """Move goals, in place, towards targets at most by a reach; their mean on the way."""
-    step = np.clip(target - goal, -reach, reach)
-    goal += step
-    late = np.abs(step) / np.maximum(reach, 1e-12)  # share of the time that it takes
-    return goal - step * late / 2
+    def _moved(self, target: Array, time: Array | float) -> Array:
+        """Move the goals towards targets for some time; their mean on the way."""
+        assert self._goal is not None
+        n = len(target)
+        goal, speed = self._goal[:n], self._speed[:n]
+        rate, acceleration = self._rate[:n], self._acceleration[:n]
+        away = target - goal
+        far, gained = np.abs(away), acceleration * time
+        wanted = np.copysign(np.minimum(rate, np.sqrt(2 * acceleration * far)), away)
+        fast = np.clip(wanted, speed - gained, speed + gained)
+        more = fast - speed
+        way = fast * time - more * np.abs(more) / (2 * acceleration)
+        there = (np.abs(way) >= far) & (way * away >= 0)
+        step = np.where(there, away, way)
+        took = np.where(there, far / np.maximum(np.abs(way), 1e-12), 1.0)
+        speed[:] = np.where(there, 0.0, fast)
+        goal += step
+        return np.asarray(goal - step * took / 2)
 
 
 class Cogging(Term):
