@@ -148,7 +148,7 @@ def diagnose(
         differentiate([model.fit], replays, nominal.noise)
     progress("what is left", 0.8)
     left = unexplained(model, selector, seen)
-    final = left.model if left else model
+    final = selector.predicting(left.model if left else model)
     evidence: dict[str, Any] = {
         "found": tuple(found),
         "enough": enough,

@@ -130,7 +130,7 @@ def _refits(diagnosis: Diagnosis, speech: Speech, chosen: Round) -> Iterator[Htm
         "Chi-squared is the sum of squared errors in units of the noise, on what was fitted and on "
         f"what was left out; without any of these {before.fit.chi2:,.0f} and "
         f"{float(before.held_out.sum()):,.0f}. Noise alone would give about "
-        f"{len(before.predicted):,}.",
+        f"{before.samples:,}.",
         columns,
         rows,
     )

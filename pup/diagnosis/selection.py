@@ -6,7 +6,7 @@ by more than chance and predict types of motion that were left out; then each is
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,21 +59,25 @@ class Model:
       hypotheses: the effects, in the order in which they were found.
       freedom: of their magnitudes and shapes, how many the data see.
       fit: of nominal parameters and effects together.
-      held_out: chi-squared of each fold, predicted by a fit without it, shape (n_folds,).
-      predicted: what those fits predict, shape (n_samples,), rad.
+      held_out: what each fold costs by a fit without it, shape (n_folds,); see `_left_out`.
+      predicted: what those fits predict, shape (n_samples,), rad; empty where nobody has asked.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     freedom: int
     fit: Fit
     held_out: Array
-    predicted: Array
+    predicted: Array = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def samples(self) -> int:
+        """Samples that it was fitted to."""
+        return 0 if self.fit.residual is None else len(self.fit.residual)
 
     @property
     def worth(self) -> float:
         """What it explains: half its chi-squared in sample, half out of it, and its complexity."""
-        samples = len(self.predicted)
-        inside = self.fit.chi2 + self.freedom * float(np.log(samples))
+        inside = self.fit.chi2 + self.freedom * float(np.log(self.samples))
         return (inside + float(self.held_out.sum())) / 2
 
 
@@ -128,7 +132,7 @@ class Selector:
         self.found = tuple(found)
         self.enough = enough
         self.folds = _folds(replays)
-        self.nominal = self.model((), nominal)
+        self.nominal = self.predicting(self.model((), nominal))
 
     def run(self) -> tuple[Model, list[Round]]:
         """The model that is left when nothing more is worth adding, and how it came about."""
@@ -258,38 +262,31 @@ class Selector:
         return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed, thorough=False)
 
     def models(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
-        """Fitted models with the predictions of fits without each fold.
-
-        A fit without a fold starts where the whole fit ends, and takes one Gauss-Newton step. A
-        long one, along what the other folds hardly see, leaves the valley that a fit would follow:
-        then what the Jacobian says of the fold is nearer to what that fit would say.
-        """
+        """Fitted models with what each fold costs them by fits without it."""
         differentiate([fit for _, fit in fitted if fit.jacobian is None], self.replays, self.noise)
-        measured = self.replays.measured
-        costs = np.zeros((len(fitted), len(self.folds)))
-        predicted = np.tile(measured.values, (len(fitted), 1))
-        insides = [measured.only(fold) for fold in self.folds]
-        moved = [[_step_without(fit, inside) for _, fit in fitted] for inside in insides]
-        asked = [
-            ([fit.row(at) for (_, fit), at in zip(fitted, points, strict=True)], fold)
-            for points, fold in zip(moved, self.folds, strict=True)
-        ]
-        for number, (inside, points, simulated) in enumerate(
-            zip(insides, moved, self.replays.together(asked), strict=True)
-        ):
-            told = np.where(np.isnan(simulated), LOST, simulated)
-            predicted[:, inside] = told
-            errors = np.zeros((len(fitted), len(measured.values)))
-            errors[:, inside] = measured.values[inside] - told
-            simulated_costs = (measured.whiten(errors, self.noise)[:, inside] ** 2).sum(axis=1)
-            costs[:, number] = np.minimum(
-                simulated_costs,
-                [_linear(fit, at, inside) for (_, fit), at in zip(fitted, points, strict=True)],
-            )
+        insides = [self.replays.measured.only(fold) for fold in self.folds]
         return [
-            Model(hypotheses, self._freedom(hypotheses), fit, cost, values)
-            for (hypotheses, fit), cost, values in zip(fitted, costs, predicted, strict=True)
+            Model(
+                hypotheses,
+                self._freedom(hypotheses),
+                fit,
+                np.array([_left_out(fit, inside) for inside in insides]),
+            )
+            for hypotheses, fit in fitted
         ]
+
+    def predicting(self, model: Model) -> Model:
+        """The model with what fits without each fold predict of it."""
+        measured = self.replays.measured
+        insides = [measured.only(fold) for fold in self.folds]
+        fits = [_without_samples(model.fit, inside) for inside in insides]
+        fit_together(fits, self.replays, self.noise, iterations=ROUGH)
+        rows = [[fit.row()] for fit in fits]
+        told = self.replays.together(list(zip(rows, self.folds, strict=True)))
+        predicted = measured.values.copy()
+        for inside, simulated in zip(insides, told, strict=True):
+            predicted[inside] = np.where(np.isnan(simulated[0]), LOST, simulated[0])
+        return replace(model, predicted=predicted)
 
 
 def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
@@ -305,27 +302,46 @@ def _material(hypothesis: Hypothesis, before: Model, after: Model) -> bool:
     at = dict(zip(after.fit.names, after.fit.at, strict=True))
     if any(abs(at[name]) >= SIZABLE for name in hypothesis.magnitudes):
         return True
-    explained = float((before.held_out - after.held_out).sum()) / len(before.predicted)
+    explained = float((before.held_out - after.held_out).sum()) / before.samples
     return explained > MATERIAL**2
 
 
-def _step_without(fit: Fit, left_out: NDArray[np.bool_]) -> Array:
-    """Where a fit without some samples would end, by one Gauss-Newton step."""
+def _without_samples(fit: Fit, inside: NDArray[np.bool_]) -> Fit:
+    """A fit to the other samples, which starts from one to all."""
     assert fit.jacobian is not None and fit.residual is not None
-    jacobian = fit.jacobian[~left_out]
-    # Directions that the data hardly see are left alone: there one step leads anywhere.
+    weight = np.where(inside, 0.0, 1.0)
+    return Fit(
+        fit.coordinates,
+        fit.at,
+        fixed=fit.fixed,
+        weight=weight,
+        residual=fit.residual,
+        jacobian=fit.jacobian,
+        chi2=float((fit.residual * weight) @ fit.residual),
+        thorough=False,
+        age=1,
+        slack=ROUGHLY,
+    )
+
+
+def _left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:
+    """What some samples cost by a fit to the others, in one Gauss-Newton step.
+
+    It is their share of minus twice the logarithm of the evidence: their squared errors, weighed by
+    how well the other samples tell where they should lie. What one type of motion alone can tell is
+    then not held against a model, but its freedom is.
+    """
+    assert fit.jacobian is not None and fit.residual is not None
+    jacobian, residual = fit.jacobian, fit.residual
+    # What a model leaves counts as noise, else a wrong form would be sure of its parameters.
+    noise = max(1.0, fit.chi2 / len(residual))
     reach = np.array([NOMINAL if c.scale is None else TYPICAL for c in fit.coordinates])
-    normal = jacobian.T @ jacobian + np.diag(1 / reach**2)
-    step = np.linalg.solve(normal, jacobian.T @ fit.residual[~left_out])
-    low, high = (np.array([getattr(c, e) for c in fit.coordinates]) for e in ("lower", "upper"))
-    return np.asarray(np.clip(fit.at + np.clip(step, -0.3, 0.3), low, high))
-
-
-def _linear(fit: Fit, at: Array, inside: NDArray[np.bool_]) -> float:
-    """Chi-squared of some samples at a point, as the Jacobian has it."""
-    assert fit.jacobian is not None and fit.residual is not None
-    told = fit.residual[inside] - fit.jacobian[inside] @ (at - fit.at)
-    return float(told @ told)
+    prior, outside = np.diag(1 / reach**2), jacobian[~inside]
+    normal = outside.T @ outside / noise + prior
+    step = np.linalg.solve(normal, outside.T @ residual[~inside] / noise)
+    own, here = jacobian[inside], residual[inside]
+    spread = np.linalg.slogdet(np.linalg.solve(normal, own.T @ own / noise) + np.eye(len(reach)))[1]
+    return float(max(here @ (here - own @ step), here @ here) + spread)
 
 
 def _folds(replays: Replays) -> list[list[int]]:

@@ -126,13 +126,13 @@ def by_time(diagnosis: Diagnosis, fit: Fit, recording: int, most: int) -> tuple[
 def described(diagnosis: Diagnosis, finding: Finding) -> float:
     """What a finding explains of all that is more than noise without it, as a share."""
     assert diagnosis.model is not None
-    excess = diagnosis.model.fit.chi2 + finding.gain - len(diagnosis.model.predicted)
+    excess = diagnosis.model.fit.chi2 + finding.gain - diagnosis.model.samples
     return float(np.clip(finding.gain / max(excess, finding.gain, 1e-300), 0.0, 1.0))
 
 
 def left_over(diagnosis: Diagnosis, model: Model) -> float:
     """Error of a model on motions left out, in units of the noise."""
-    return float(np.sqrt(model.held_out.sum() / len(model.predicted)))
+    return float(np.sqrt(np.mean(_squares(diagnosis, model))))
 
 
 def smallest_material(diagnosis: Diagnosis) -> float:

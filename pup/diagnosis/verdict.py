@@ -106,7 +106,7 @@ def probabilities(models: Sequence[Model], final: Model) -> Array:
 
 def left_over(model: Model) -> float:
     """Chi-squared that a model leaves beyond noise."""
-    return max(model.fit.chi2 - len(model.predicted), 0.0)
+    return max(model.fit.chi2 - model.samples, 0.0)
 
 
 def doubt(nominal: Model, final: Model) -> float:
