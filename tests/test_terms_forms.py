@@ -148,13 +148,16 @@ def test_back_emf_leaves_no_torque_at_a_terminal_speed() -> None:
         assert way[before] == pytest.approx(expected[before], abs=1e-3)
 
 
-@pytest.mark.parametrize("ramp", [1e-4, 0.02, 0.1])
+@pytest.mark.parametrize("ramp", [0.0, 1e-4, 0.02, 0.1])
 def test_a_rate_limit_makes_a_step_a_ramp_from_when_it_is_told(ramp: float) -> None:
     """Steady, the joint is late behind the ramp by kd / kp; the step comes between sub-steps."""
     time = np.array([0.0, 0.1003, *np.arange(0.11, 0.5, 0.01)])
     target = np.where(time > 0.05, 1.0, 0.0)
     run = recording(BENCH, time, target, setup=LIGHT)
-    gradual = {f"target_rate_limit/slowness{AT}": 0.5, f"target_rate_limit/ramp{AT}": ramp}
+    gradual = {
+        f"target_rate_limit/{name}{AT}": value
+        for name, value in (("slowness", 0.5), ("sluggishness", ramp / 2))
+    }
     (read,) = bench(run, gradual)
     on = (time > 0.35) & (time < 0.45)
     expected = 2.0 * (time - 0.1003 - ramp / 2 - KD / KP)

@@ -169,7 +169,8 @@ def diagnose(
     named = findings(model, rounds, selector, measured, seen) if model.hypotheses else ()
     progress("next recording", 0.95)
     ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
-    evidence["findings"] = (*named, left.finding) if left else named
+    every = (*named, left.finding) if left else named
+    evidence["findings"] = tuple(sorted(every, key=lambda finding: -finding.gain))
     return told("mismatch", ask=ask, **evidence)
 
 

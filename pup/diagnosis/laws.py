@@ -10,7 +10,7 @@ EQUATIONS = {
     "gear_efficiency": "tau = tau_m - e |tau_m| sgn(qdot)",
     "quadratic_damping": "tau -= b qdot |qdot|",
     "torque_speed_limit": "|tau| <= tau_max - b |qdot|",
-    "target_rate_limit": "|d goal/dt| <= 1/s, |d2 goal/dt2| <= 1/(s ramp)",
+    "target_rate_limit": "|d goal/dt| <= 1/slowness, |d2 goal/dt2| <= 1/sluggishness",
     "command_delay": "target(t) = command(t - d)",
     "measurement_delay": "reading(t) = q(t - d)",
     "actuator_lag": "dtau/dt = (tau_m - tau)/T",

@@ -13,6 +13,8 @@ from pup.diagnosis.wording import Speech, capital, digits, effect_words, minus, 
 from pup.physics.terms import TERMS, column
 from pup.sysid.wording import listed
 
+SLOW, TARDY = 1 / 100, 1 / 5000
+"""A goal that is allowed more than 100 rad/s, or 5000 rad/s2, goes as it likes."""
 QUARTER = np.pi / 2
 MOSTLY = 0.5
 """A law that explains a smaller share of something does not describe it."""
@@ -185,6 +187,15 @@ def _speed_limit(f: Facts) -> str:
     )
 
 
+def _goal_limit(f: Facts) -> str:
+    top = f.speech.speed(1 / max(f.size["slowness"], 1e-9))
+    gained = f.speech.speed(0.01 / max(f.size["sluggishness"], 1e-9))
+    told = [f"gains no more than {gained} in 10 ms"] if f.size["sluggishness"] > TARDY else []
+    if f.size["slowness"] > SLOW or not told:
+        told.insert(0, f"goes no faster than {top}")
+    return f"The firmware moves the goal of {f.at} by a profile of its own: it {listed(told)}."
+
+
 def _sag(f: Facts) -> str:
     lost = 1 - 1 / (1 + f.size["drop"] * f.strength)
     return (
@@ -292,10 +303,7 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     ),
     "quadratic_damping": _drag,
     "torque_speed_limit": _speed_limit,
-    "target_rate_limit": lambda f: (
-        f"The firmware moves the goal of {f.at} by no more than "
-        f"{f.speech.speed(1 / max(f.size['slowness'], 1e-9))}."
-    ),
+    "target_rate_limit": _goal_limit,
     "command_delay": lambda f: (
         f"Commands to {f.at} arrive {f.speech.quantity(f.size['time'], 's')} late."
     ),

@@ -41,6 +41,7 @@ _QUANTITIES = {
     "rest": "more at rest",
     "drop": "drop per total torque",
     "slowness": "time per way",
+    "sluggishness": "time per speed gained",
     "teeth": "ripples per turn",
 }
 _SLIDING = {
@@ -54,6 +55,7 @@ _SLIDING = {
     "rad/(N m)": "m/N",
     "1/(N m)": "1/N",
     "s/rad": "s/m",
+    "s2/rad": "s2/m",
     "kg m2": "kg",
 }
 

@@ -125,6 +125,8 @@ class GainAsymmetry(Term):
         drive.torque *= np.where(drive.error > 0, 1 + share, 1 - share)
 
 
+AT_LIMIT = 0.999
+"""Share of its torque limit from which a servo integrates its error no further."""
 WEAK = 0.02
 """An integral gain far below takes longer than anyone waits to take up a load, N m/(rad s)."""
 
@@ -152,9 +154,10 @@ class IntegralAction(Term):
 
     def settle(self, error: Array, torque: Array) -> None:
         """See Term."""
-        n = len(error)
-        grown = self._sum[:n] + self.scene.timestep * error
-        most = self.scene.limit[:n] / np.maximum(self.values["gain"][:n], 1e-9)
+        n, limit = len(error), self.scene.limit[: len(error)]
+        wound = (np.abs(torque) >= AT_LIMIT * limit) & (torque * error > 0)
+        grown = self._sum[:n] + np.where(wound, 0.0, self.scene.timestep * error)
+        most = limit / np.maximum(self.values["gain"][:n], 1e-9)
         self._sum[:n] = np.clip(grown, -most, most)
 
 
@@ -174,22 +177,23 @@ class DeadBand(Term):
 class TargetRateLimit(Term):
     """The controller's goal moves at most at some speed towards the command.
 
-    It takes up and leaves that speed gradually, as servos with a profile acceleration do.
+    Its speed changes at most at some acceleration, as in servos with a motion profile.
     """
 
     effect = "target_rate_limit"
     kinds = ("joint", "group", "bus")
     quantities = (
         Quantity("slowness", "s/rad", 0.25, 2.0),
-        Quantity("ramp", "s", 0.02, 1.0, grid=(0.02,)),
+        Quantity("sluggishness", "s2/rad", 0.005, 0.1),
     )
-    source = "3 to 5 rad/s; BAM (arXiv:2410.08650) has it in the STS3215; ramps: an estimate"
+    source = "3 to 5 rad/s; BAM (arXiv:2410.08650) has it in the STS3215; 200 rad/s2: an estimate"
 
     def prepare(self) -> None:
         """See Term."""
-        slowness = np.maximum(self.values["slowness"], 1e-9)
-        self._rate = 1 / slowness
-        self._acceleration = self._rate / self.values["ramp"]
+        slowness, sluggishness = (self.values[name] for name in ("slowness", "sluggishness"))
+        self._rate = 1 / np.maximum(slowness, 1e-9)
+        self._acceleration = 1 / np.maximum(sluggishness, 1e-9)
+        self._limited = (slowness > 0) | (sluggishness > 0)
         self._goal: Array | None = None
         self._speed = np.zeros_like(slowness)
 
@@ -198,7 +202,7 @@ class TargetRateLimit(Term):
         n = len(now)
         if self._goal is None:
             self._goal = before.copy()
-        limited = self.values["slowness"][:n] > 0
+        limited = self._limited[:n]
         earlier = self._moved(before, self.scene.timestep * (1 - share))
         later = self._moved(now, self.scene.timestep * share)
         return np.where(limited, later, now), np.where(limited, earlier, before)
