@@ -87,6 +87,12 @@ def _diagnose(verb: argparse.ArgumentParser) -> None:
     recordings(verb)
     robot(verb, required=True)
     out(verb, "diagnosis.json, report.html and corrected/, a robot with what was missing")
+    verb.add_argument(
+        "--rivals",
+        action="store_true",
+        help="also fit the paper's NN-PD and a residual network to the same recordings and judge "
+        "all by motions left out; takes longer and needs PyTorch (the extra `learn`)",
+    )
     seed(verb)
     place(verb)
 

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -108,10 +109,16 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
     from services.diagnosis import run_diagnosis
     from services.progress import stages
 
+    if options.rivals and find_spec("torch") is None:
+        raise InputError(
+            "--rivals needs PyTorch, which is not installed; leave it out or install pup[learn]"
+        )
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
     with _folder(options.out) as out, places.replays(options) as where, stages() as progress:
-        return run_diagnosis(robot, recordings, out, where, progress, options.seed)
+        return run_diagnosis(
+            robot, recordings, out, where, progress, options.seed, rivals=options.rivals
+        )
 
 
 def _import(options: argparse.Namespace) -> dict[str, Any]:

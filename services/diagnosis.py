@@ -11,11 +11,13 @@ from threadpoolctl import threadpool_limits
 
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis, diagnose
-from pup.diagnosis.replays import Bench, Runner, threads
+from pup.diagnosis.replays import Bench, Replays, Runner, threads
 from pup.diagnosis.report import write_report
 from pup.diagnosis.residuals import Measured
+from pup.diagnosis.rivals import Rivals, compare
 from pup.diagnosis.store import Store
 from pup.files import write_json
+from pup.physics.parameters import robot_space
 from pup.physics.terms import split_column
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
@@ -38,19 +40,21 @@ class Where:
     """Where batches of replays run.
 
     Attributes:
-      runner: makes what runs them.
+      runner: makes what runs them with an actuator, `pd` or `nn_pd`.
       lanes: how many run at once.
       here: whether in this process, whose processor time then is the diagnosis's.
     """
 
-    runner: Callable[[Measured], Runner]
+    runner: Callable[[Measured, str], Runner]
     lanes: int
     here: bool
 
 
 def alone(cores: int) -> Where:
     """In threads of this process."""
-    return Where(lambda measured: threads(Bench(measured), cores), cores, here=True)
+    return Where(
+        lambda measured, actuator: threads(Bench(measured, actuator), cores), cores, here=True
+    )
 
 
 def run_diagnosis(
@@ -61,6 +65,7 @@ def run_diagnosis(
     progress: Progress,
     seed: int = 0,
     report: bool = True,
+    rivals: bool = False,
 ) -> dict[str, Any]:
     """Diagnose recordings and write the files; run again, it goes on where it was stopped.
 
@@ -72,6 +77,7 @@ def run_diagnosis(
       progress: told the stage and the share of all that is done.
       seed: of everything random.
       report: whether to write `report.html` too.
+      rivals: whether to fit and judge rivals too, which needs PyTorch.
 
     Returns:
       The document of `diagnosis.json`: that of the contract, and how many `seconds` it took from
@@ -80,29 +86,50 @@ def run_diagnosis(
     kept = out / CHECKPOINTS
     watch = Stopwatch(kept / SPENT, _digest(robot, recordings))
     run = keeper(where, robot, kept)
+    others = None
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads, a verdict must not
         found = diagnose(
             robot, recordings, lambda m: watch.around(run(m)), where.lanes, progress, seed
         )
+        if rivals:
+            progress("rivals", 0.97)
+            others = _rivals(found, where, kept, watch, seed)
     told = document(found, _write_corrected(found, out))
+    if rivals:
+        told["rivals"] = others.document() if others else None
     seconds, processor = watch.spent()
     told |= {"seconds": seconds} | ({"processor_seconds": processor} if where.here else {})
     write_json(out / DIAGNOSIS, told)
     if report:
         progress("report", 0.98)
-        write_report(found, out / "report.html", _provenance(robot, recordings, told, seed))
+        source = _provenance(robot, recordings, told, seed)
+        write_report(found, out / "report.html", source, others)
     _clear(kept)
     progress("done", 1.0)
     return told
 
 
-def keeper(where: Where, robot: RobotDescription, kept: Path) -> Callable[[Measured], Runner]:
+def _rivals(
+    found: Diagnosis, where: Where, kept: Path, watch: Stopwatch, seed: int
+) -> Rivals | None:
+    """Rivals of a diagnosis, whose replays are kept as the diagnosis's own are."""
+
+    def replays_with(actuator: str) -> Replays:
+        run = watch.around(keeper(where, found.robot, kept, actuator)(found.measured))
+        return Replays(found.measured, robot_space(found.robot, actuator), run, where.lanes)
+
+    return compare(found, replays_with, seed)
+
+
+def keeper(
+    where: Where, robot: RobotDescription, kept: Path, actuator: str = "pd"
+) -> Callable[[Measured], Runner]:
     """What runs batches of replays and keeps the answers in a folder."""
 
     def runner(measured: Measured) -> Runner:
         # Planned recordings are replayed too, and their answers are not of those measured.
-        store = Store(kept, _digest(robot, measured.recordings))
-        return store.around(where.runner(measured))
+        store = Store(kept, _digest(robot, measured.recordings))  # names tell actuators apart
+        return store.around(where.runner(measured, actuator))
 
     return runner
 

@@ -74,3 +74,7 @@ def diagnosis_table(document: dict[str, Any]) -> None:
             f"noise floor {1e3 * floor['rms']:.2f} mrad ({floor['source']})",
             soft_wrap=True,
         )
+    if document.get("rivals"):
+        models = document["rivals"]["models"].items()
+        told = ", ".join(f"{name} {1e3 * model['rmse']:.2f} mrad" for name, model in models)
+        console.print(f"beside rivals: {told}", soft_wrap=True)

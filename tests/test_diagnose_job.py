@@ -134,10 +134,10 @@ def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path
     """Two sets of recordings under the same parameters are two questions."""
     asked: list[int] = []
 
-    def runner(measured: Measured) -> Runner:
+    def runner(measured: Measured, actuator: str) -> Runner:
         def run(batches: Sequence[Batch]) -> list[NDArray[np.float64]]:
             asked.append(len(batches))
-            return threads(Bench(measured), 1)(batches)
+            return threads(Bench(measured, actuator), 1)(batches)
 
         return run
 

@@ -23,13 +23,13 @@ _BENCHES: dict[str, Bench] = {}
 CACHED = 4
 
 
-def ray_runner(measured: Measured) -> Runner:
-    """A runner of batches on the Ray cluster this process is connected to."""
+def ray_runner(measured: Measured, actuator: str) -> Runner:
+    """A runner of batches with an actuator on the Ray cluster this process is connected to."""
     shared = ray.put(measured)
     name = shared.hex()
 
     def run(batches: Sequence[Batch]) -> list[Array]:
-        answers = [replay.remote(name, [shared], batch) for batch in batches]
+        answers = [replay.remote(name, [shared], actuator, batch) for batch in batches]
         return list(ray.get(answers))
 
     return run
@@ -41,10 +41,10 @@ def lanes() -> int:
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)
-def replay(name: str, measured: list[Any], batch: Batch) -> Array:
+def replay(name: str, measured: list[Any], actuator: str, batch: Batch) -> Array:
     """Samples of one batch."""
     if name not in _BENCHES:
         if len(_BENCHES) >= CACHED:
             _BENCHES.clear()
-        _BENCHES[name] = Bench(ray.get(measured[0]))
+        _BENCHES[name] = Bench(ray.get(measured[0]), actuator)
     return _BENCHES[name].run(batch)

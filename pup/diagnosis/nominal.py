@@ -131,7 +131,9 @@ def _start(
 
 def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator) -> float:
     """How far a fit of its own simulation ends from it, in standard deviations."""
-    deviation = np.sqrt(np.diag(fit.covariance()))
+    # What the model leaves counts as noise here too: nothing is known better than that.
+    misfit = max(1.0, fit.chi2 / len(replays.measured.values))
+    deviation = np.sqrt(misfit * np.diag(fit.covariance()))
     away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
     low, high = ([getattr(c, end) for c in fit.coordinates] for end in ("lower", "upper"))
     start = np.clip(fit.at + away, low, high)

@@ -13,6 +13,7 @@ from pup.diagnosis import (
     report_findings,
     report_fit,
     report_missing,
+    report_rivals,
     report_splits,
     report_unknown,
     summary,
@@ -21,6 +22,7 @@ from pup.diagnosis.drawing import draw_robot
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS, WORDS
 from pup.diagnosis.report_findings import badge, otherwise
+from pup.diagnosis.rivals import Rivals
 from pup.diagnosis.sentences import items
 from pup.diagnosis.wording import Speech, capital, minus, percent
 from pup.files import write_atomic
@@ -38,7 +40,12 @@ LIST = "list-style: none; padding-left: 0; font-size: 1.15rem"
 """Looks of the list of what is missing."""
 
 
-def write_report(diagnosis: Diagnosis, path: Path, provenance: Mapping[str, Any]) -> None:
+def write_report(
+    diagnosis: Diagnosis,
+    path: Path,
+    provenance: Mapping[str, Any],
+    rivals: Rivals | None = None,
+) -> None:
     """Write `report.html`, whole or not at all.
 
     Args:
@@ -46,15 +53,19 @@ def write_report(diagnosis: Diagnosis, path: Path, provenance: Mapping[str, Any]
       path: the file.
       provenance: how it came about, as JSON values; under `next_recording` what to record next,
         with `motion`, `reason` and `splits`, if anything.
+      rivals: other models of the same recordings, if any were fitted.
     """
     with drawing_style():
-        content = _Report(diagnosis, provenance).content()
+        content = _Report(diagnosis, provenance, rivals).content()
         write_atomic(path, page(f"Diagnosis of {diagnosis.robot.name}", *content))
 
 
 class _Report:
-    def __init__(self, diagnosis: Diagnosis, provenance: Mapping[str, Any]) -> None:
+    def __init__(
+        self, diagnosis: Diagnosis, provenance: Mapping[str, Any], rivals: Rivals | None
+    ) -> None:
         self.diagnosis = diagnosis
+        self.rivals = rivals
         units = JointUnits.of(diagnosis.robot, diagnosis.measured.recordings)
         self.speech = Speech(diagnosis.robot, units)
         self.provenance = {k: v for k, v in provenance.items() if k != NEXT}
@@ -72,6 +83,7 @@ class _Report:
             "Parameters that differ between halves of the data": lambda: report_splits.gaps(*case),
             "What no known effect explains": lambda: report_unknown.left(*case),
             errors: lambda: report_errors.before_and_after(*case),
+            "Beside its rivals": lambda: report_rivals.beside(*case, self.rivals),
             "When the model is off": lambda: report_errors.maps(*case),
             "Evidence": lambda: report_evidence.evidence(*case),
             "What could hide": lambda: report_evidence.hiding(*case),

@@ -43,8 +43,8 @@ FORM = 0.03
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
 is no evidence of another."""
 REST = 0.3
-"""Share of what others left at its joints that a further effect explains: a wrong form of theirs is
-made up for by many small effects, a second effect by one."""
+"""Share of what is more than noise at its joints that an effect explains: for what the library does
+not know, and for a wrong form of what was found, many small effects make up; a true one does more."""
 MATERIAL = 0.3
 """An effect is material if it explains an error of this share of the noise, ..."""
 SIZABLE = 0.25
@@ -177,12 +177,9 @@ class Selector:
         others = [m for m in finalists if m not in holds]
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
-    def _second(self, before: Model, after: Model) -> bool:
-        """Whether an effect is more than what is wrong in the forms of those at its joints."""
-        robot = self.replays.measured.robot
-        own = _joints(after.hypotheses[-1].place, robot)
-        if not any((own & _joints(h.place, robot)).any() for h in before.hypotheses):
-            return True
+    def _explains(self, before: Model, after: Model) -> bool:
+        """Whether an effect explains much of what more than noise there is at its joints."""
+        own = _joints(after.hypotheses[-1].place, self.replays.measured.robot)
         here = own[self.replays.measured.channel]
         assert before.fit.residual is not None and after.fit.residual is not None
         then, now = before.fit.residual[here] ** 2, after.fit.residual[here] ** 2
@@ -210,7 +207,7 @@ class Selector:
         outside = float((before.held_out - after.held_out).sum())
         if outside <= max(KEPT * inside, 0.5 * self.enough):
             return False
-        if inside <= self.blur(before) or not self._second(before, after):
+        if inside <= self.blur(before) or not self._explains(before, after):
             return False
         return _material(after.hypotheses[-1], before, after)
 
