@@ -43,8 +43,9 @@ FORM = 0.03
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
 is no evidence of another."""
 REST = 0.3
-"""Share of what is more than noise at its joints that an effect explains: for what the library does
-not know, and for a wrong form of what was found, many small effects make up; a true one does more."""
+"""Share of what is more than noise at its joints that an effect explains. Many small effects make
+up for what the library does not know, and for a wrong form of what was found; a true one explains
+more."""
 MATERIAL = 0.3
 """An effect is material if it explains an error of this share of the noise, ..."""
 SIZABLE = 0.25
