@@ -167,7 +167,7 @@ class Maker:
         after = self.model(hypothesis, 1.0)
         rival = self.model(rest[0].hypothesis, 2.0)
         ranking = scores(traces, strong)
-        first = Round(before, tuple(ranking), (after, rival), True)
+        first = Round(before, tuple(ranking), (after, rival), 2)
         return replace(
             base,
             verdict="mismatch",

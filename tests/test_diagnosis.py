@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.engine import Diagnosis, diagnose
-from pup.diagnosis.evidence import Projector, scores, threshold, traces
+from pup.diagnosis.evidence import Projector, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Coordinate, Fit, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.replays import Batch, Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise, noise_floor, steady_start
 from pup.diagnosis.store import Store
+from pup.diagnosis.tracing import traces
 from pup.physics.parameters import robot_space
 from tests.diagnosis_cases import BENCH, recordings
 

@@ -253,7 +253,7 @@ def test_report_of_undetermined(bench: Maker, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_finding_that_was_not_added_is_told(backlash: Diagnosis, tmp_path: Path) -> None:
-    chosen = replace(backlash.rounds[0], accepted=False)
+    chosen = replace(backlash.rounds[0], holding=0)
     before = chosen.before
     shown = page(
         replace(backlash, verdict="none", findings=(), model=before, rounds=(chosen,)), tmp_path

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.discover import Unexplained, unexplained
-from pup.diagnosis.evidence import Trace, threshold, traces
+from pup.diagnosis.evidence import Trace, threshold
 from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import differentiate
 from pup.diagnosis.hypotheses import hypotheses
@@ -19,6 +19,7 @@ from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise, assumed_noise
 from pup.diagnosis.selection import Model, Round, Selector
 from pup.diagnosis.splits import Split, splits
+from pup.diagnosis.tracing import traces
 from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space

@@ -1,9 +1,8 @@
 """The score test: which effect, at which place, the nominal fit's errors look like.
 
-A hypothesis is simulated once, at a moderate size, joint by joint where it is of several; what the
-nominal parameters can imitate of its trace is projected out of it; what is left is matched with the
-errors (a Lagrange-multiplier test). Matched filters find traces far below the noise. How large the
-largest of so many scores becomes by chance follows from the traces alone.
+What the nominal parameters can imitate of a hypothesis's trace is projected out of it; what is left
+is matched with the errors (a Lagrange-multiplier test). Matched filters find traces far below the
+noise. How large the largest of so many scores becomes by chance follows from the traces alone.
 """
 
 from collections.abc import Sequence
@@ -13,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pup.diagnosis.fitting import Fit
-from pup.diagnosis.hypotheses import MODERATE, Hypothesis
-from pup.diagnosis.probing import changes
-from pup.diagnosis.replays import Replays
-from pup.diagnosis.residuals import Noise
-from pup.robot import RobotDescription
+from pup.diagnosis.hypotheses import Hypothesis
 
 Array = NDArray[np.float64]
 
@@ -96,59 +90,8 @@ class Projector:
         return np.asarray(columns - self.basis @ (self.basis.T @ columns))
 
 
-def traces(
-    hypotheses: Sequence[Hypothesis],
-    base: Fit,
-    replays: Replays,
-    noise: Noise,
-) -> list[Trace]:
-    """Simulate hypotheses around a fit, all in one replay.
-
-    Args:
-      hypotheses: what to simulate.
-      base: a fit with its Jacobian.
-      replays: simulates.
-      noise: weighs the samples.
-    """
-    assert base.jacobian is not None
-    alone, sums = _split(hypotheses, replays.measured.robot)
-    probes = [probe for h in alone for probe in h.probes()]
-    changed = replays.measured.whiten(changes([(base.row(), probes)], replays)[0], noise)
-    wholes: dict[Hypothesis, Array] = {}
-    next_row = 0
-    for hypothesis in alone:
-        count = len(hypothesis.magnitudes)
-        wholes[hypothesis] = changed[next_row : next_row + count].T / MODERATE
-        next_row += count
-    for hypothesis, members in sums.items():
-        wholes[hypothesis] = np.sum([wholes[h] for h in members], axis=0)
-    project = Projector(base.jacobian)
-    told = (_trace(h, wholes[h], project) for h in hypotheses)
-    return [trace for trace in told if trace is not None]
-
-
-def _split(
-    hypotheses: Sequence[Hypothesis], robot: RobotDescription
-) -> tuple[list[Hypothesis], dict[Hypothesis, list[Hypothesis]]]:
-    """Those to simulate, and those of several joints, whose traces are the sums of each joint's."""
-    at_joints = {(h.effect, h.place.name, h.form): h for h in hypotheses if h.place.kind == "joint"}
-    alone: list[Hypothesis] = []
-    sums: dict[Hypothesis, list[Hypothesis]] = {}
-    for hypothesis in hypotheses:
-        members = [
-            at_joints.get((hypothesis.effect, robot.joint_names[i], hypothesis.form))
-            for i in hypothesis.place.joints(robot)
-        ]
-        known = [m for m in members if m is not None]
-        if hypothesis.place.kind == "joint" or not members or len(known) < len(members):
-            alone.append(hypothesis)
-        else:
-            sums[hypothesis] = known
-    return alone, sums
-
-
-def _trace(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | None:
-    """The trace of a hypothesis; None where the data cannot show it."""
+def traced(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | None:
+    """The trace of a hypothesis, whitened; None where the data cannot show it."""
     return _seen(hypothesis, whole, project) if np.isfinite(whole).all() else None
 
 

@@ -19,26 +19,33 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 
 
-def changes(asked: Sequence[tuple[Row, Sequence[Row]]], replays: Replays) -> list[Array]:
+def changes(
+    asked: Sequence[tuple[Row, Sequence[Row]]],
+    replays: Replays,
+    recordings: Sequence[int] | None = None,
+) -> list[Array]:
     """What probes change in the samples; see `probed`."""
-    return [changed for _, changed in probed(asked, replays)]
+    return [changed for _, changed in probed(asked, replays, recordings)]
 
 
 def probed(
-    asked: Sequence[tuple[Row, Sequence[Row]]], replays: Replays
+    asked: Sequence[tuple[Row, Sequence[Row]]],
+    replays: Replays,
+    recordings: Sequence[int] | None = None,
 ) -> list[tuple[Array, Array]]:
     """Simulations of some rows, and what probes change in them, all in one replay.
 
     Args:
       asked: where some probes start, and the columns that each of them sets.
       replays: simulates.
+      recordings: simulate these only, and leave the others' samples at zero.
 
     Returns:
       For each of them its samples, shape (n_samples,), and the changes, shape (n_probes,
       n_samples), rad.
     """
     measured = replays.measured
-    every = range(len(measured.recordings))
+    every = range(len(measured.recordings)) if recordings is None else recordings
     ground = [i for i in every if measured.recordings[i].support == "ground"]
     fixed = [i for i in every if i not in ground]
     limbs = limbs_of(measured.robot, measured.recordings)

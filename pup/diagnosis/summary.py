@@ -61,6 +61,7 @@ class Rival:
       inside: drop of chi-squared on what it was fitted to.
       outside: drop on motions left out.
       probability: of it among the finalists.
+      holds: whether it might have been added.
     """
 
     score: Score
@@ -68,6 +69,7 @@ class Rival:
     inside: float
     outside: float
     probability: float
+    holds: bool
 
 
 def channels(diagnosis: Diagnosis) -> list[int]:
@@ -204,8 +206,9 @@ def rivals(chosen: Round, final: Model | None = None) -> list[Rival]:
             chosen.before.fit.chi2 - model.fit.chi2,
             float((chosen.before.held_out - model.held_out).sum()),
             float(chance),
+            number < len(likely),
         )
-        for model, chance in zip(chosen.finalists, chances, strict=True)
+        for number, (model, chance) in enumerate(zip(chosen.finalists, chances, strict=True))
     ]
 
 
@@ -214,7 +217,7 @@ def why_behind(rival: Rival, best: Rival) -> str:
     same = overlap(rival.score.trace, best.score.trace)
     if rival.outside <= KEPT * rival.inside:
         return "fits these motions but does not predict others"
-    if rival.probability == 0:
+    if not rival.holds:
         return "explains too little of what is left to be more than a wrong form of the others"
     if rival.probability >= WORTH_SAYING:
         return f"hardly to be told apart: {100 * same:.0f} % the same trace"

@@ -1,0 +1,99 @@
+"""What each hypothesis changes in the samples, with as few simulations as can tell it.
+
+A hypothesis is simulated once, at a moderate size. While the torso is fixed, joints are simulated
+one by one, limbs sharing simulations, and what several joints change together is the sum of what
+each does. On the ground everything moves everything and a simulation costs five times as much:
+there joints are first simulated together, and one by one only where they look, together, like the
+errors.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.evidence import Projector, Trace, scores, traced
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.hypotheses import MODERATE, Hypothesis
+from pup.diagnosis.probing import changes
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Noise
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+
+PROMISING = 12
+"""Hypotheses of several joints whose joints are simulated one by one on the ground too."""
+
+
+def traces(
+    hypotheses: Sequence[Hypothesis],
+    base: Fit,
+    replays: Replays,
+    noise: Noise,
+) -> list[Trace]:
+    """Simulate hypotheses around a fit.
+
+    The trace of a single joint that does not look promising on the ground has nothing there.
+
+    Args:
+      hypotheses: what to simulate.
+      base: a fit with its Jacobian.
+      replays: simulates.
+      noise: weighs the samples.
+    """
+    assert base.jacobian is not None and base.residual is not None
+    recordings = replays.measured.recordings
+    ground = [i for i, r in enumerate(recordings) if r.support == "ground"]
+    fixed = [i for i in range(len(recordings)) if i not in ground]
+    together = _together(hypotheses, replays.measured.robot)
+    members = {h for several in together.values() for h in several}
+    project = Projector(base.jacobian)
+
+    def simulated(some: Iterable[Hypothesis], where: Sequence[int]) -> dict[Hypothesis, Array]:
+        return _simulated(list(some), where, base, replays, noise)
+
+    wholes = simulated((h for h in hypotheses if h not in together), fixed)
+    wholes |= {h: np.sum([wholes[m] for m in several], axis=0) for h, several in together.items()}
+    if ground:
+        for h, whole in simulated((h for h in hypotheses if h not in members), ground).items():
+            wholes[h] = wholes[h] + whole
+        seen = (traced(h, wholes[h], project) for h in together)
+        ranking = scores([t for t in seen if t is not None], base.residual)[:PROMISING]
+        close = dict.fromkeys(m for s in ranking for m in together[s.trace.hypothesis])
+        for h, whole in simulated(close, ground).items():
+            wholes[h] = wholes[h] + whole
+    told = (traced(h, wholes[h], project) for h in hypotheses)
+    return [trace for trace in told if trace is not None]
+
+
+def _simulated(
+    hypotheses: Sequence[Hypothesis],
+    recordings: Sequence[int],
+    base: Fit,
+    replays: Replays,
+    noise: Noise,
+) -> dict[Hypothesis, Array]:
+    """Whitened changes of some recordings' samples per typical size, (n_samples, n_magnitudes)."""
+    probes = [probe for h in hypotheses for probe in h.probes()]
+    changed = changes([(base.row(), probes)], replays, recordings)[0]
+    white = replays.measured.whiten(changed, noise) / MODERATE
+    ends = np.cumsum([0, *(len(h.magnitudes) for h in hypotheses)])
+    return {h: white[a:b].T for h, a, b in zip(hypotheses, ends[:-1], ends[1:], strict=True)}
+
+
+def _together(
+    hypotheses: Sequence[Hypothesis], robot: RobotDescription
+) -> Mapping[Hypothesis, list[Hypothesis]]:
+    """Hypotheses of several joints, each with those of its joints alone."""
+    at_joints = {(h.effect, h.place.name, h.form): h for h in hypotheses if h.place.kind == "joint"}
+    told: dict[Hypothesis, list[Hypothesis]] = {}
+    for hypothesis in hypotheses:
+        members = [
+            at_joints.get((hypothesis.effect, robot.joint_names[i], hypothesis.form))
+            for i in hypothesis.place.joints(robot)
+        ]
+        known = [m for m in members if m is not None]
+        if hypothesis.place.kind != "joint" and members and len(known) == len(members):
+            told[hypothesis] = known
+    return told

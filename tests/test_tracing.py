@@ -1,0 +1,67 @@
+"""Traces put together from few simulations against those of simulations of their own."""
+
+import numpy as np
+import pytest
+
+from pup.diagnosis.fitting import Fit, fit_together, nominal_coordinate
+from pup.diagnosis.hypotheses import MODERATE, Hypothesis, hypotheses
+from pup.diagnosis.replays import Bench, Replays, threads
+from pup.diagnosis.residuals import Measured, assumed_noise
+from pup.diagnosis.tracing import traces
+from pup.physics.parameters import robot_space
+from pup.recording import load_recordings
+from pup.robot import RobotDescription
+
+OP2 = RobotDescription.load("darwin_op2")
+SHIPPED = OP2.model_path.parent / "recordings"
+
+
+@pytest.fixture(scope="module")
+def replays() -> Replays:
+    """One recording in the air and one on the ground."""
+    runs = load_recordings([SHIPPED / f"{name}.parquet" for name in ("step_0.1_0", "standup_2")])
+    measured = Measured.of(OP2, runs)
+    return Replays(measured, robot_space(OP2, "pd"), threads(Bench(measured), 1), 1)
+
+
+@pytest.fixture(scope="module")
+def base(replays: Replays) -> Fit:
+    """The robot as it is described, with its sensitivity to one gain."""
+    coordinate = nominal_coordinate(replays.space, "kp/hip")
+    nominal = replays.space.nominal[replays.space.names.index("kp/hip")]
+    fit = Fit((coordinate,), np.array([coordinate.coordinate(nominal)]))
+    fit_together([fit], replays, assumed_noise(replays.measured), iterations=1)
+    return fit
+
+
+def test_what_joints_change_together_is_the_sum_of_each(replays: Replays, base: Fit) -> None:
+    """In the air by superposition, on the ground by a simulation of all, but for rounding."""
+    noise = assumed_noise(replays.measured)
+    asked = [h for h in hypotheses(replays.measured) if h.effect == "quadratic_damping"]
+    found = {t.hypothesis: t.whole[:, 0] for t in traces(asked, base, replays, noise)}
+    air = replays.measured.only([0])
+    told = [h for h in asked if h.place.kind == "group" and h in found]
+    assert told
+    for hypothesis in told:
+        own = _simulated(hypothesis, base, replays)
+        assert np.linalg.norm((found[hypothesis] - own)[air]) < 0.1 * np.linalg.norm(own[air])
+        assert found[hypothesis][~air] == pytest.approx(own[~air], rel=0.02, abs=0.02)
+
+
+def test_joints_of_promising_groups_are_simulated_on_the_ground(
+    replays: Replays, base: Fit
+) -> None:
+    noise = assumed_noise(replays.measured)
+    asked = [h for h in hypotheses(replays.measured) if h.effect == "quadratic_damping"]
+    ground = replays.measured.only([1])
+    for trace in traces(asked, base, replays, noise):
+        if trace.hypothesis.place.kind == "joint":  # there are fewer groups than are promising
+            own = _simulated(trace.hypothesis, base, replays)
+            assert trace.whole[ground, 0] == pytest.approx(own[ground], rel=0.02, abs=0.02)
+
+
+def _simulated(hypothesis: Hypothesis, base: Fit, replays: Replays) -> np.ndarray:
+    """The trace of a hypothesis by a simulation of its own."""
+    here, there = replays([base.row(), {**base.row(), **hypothesis.probes()[0]}])
+    noise = assumed_noise(replays.measured)
+    return np.asarray(replays.measured.whiten((there - here)[None], noise)[0] / MODERATE)
