@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from pup.diagnosis.figures import AFTER, BEFORE, name_rows
-from pup.sysid.figures import AMBER, INK, PALE, PURPLE, WIDTH, as_svg, new_figure
+from pup.sysid.figures import AMBER, INK, PURPLE, WIDTH, as_svg, new_figure
 from pup.sysid.html import Drawing
 
 LOOKS = {
@@ -17,9 +17,13 @@ LOOKS = {
     "diagnosed": (AFTER, "D"),
 }
 """Colour and mark of each model; the nominal and the corrected one as in the other figures."""
+BAND = "#f1f3f5"
+"""Behind every other row."""
+APART = 0.3
+"""The first and the last model stand this far above and below their row: equals hide none."""
 WIDE = 6.0
 """Where errors differ by a larger factor, the axis is logarithmic."""
-TICKS = (1, 2, 5)
+TICKS = (1, 2, 3, 5, 7)
 """Round numbers of each decade that such an axis has."""
 
 
@@ -41,14 +45,17 @@ def rival_dots(
     """
     values = {name: 1000 * np.array(told) for name, told in errors.items()}
     every = np.stack(list(values.values()))
-    figure = new_figure(WIDTH, 1.3 + 0.32 * len(names))
+    figure = new_figure(WIDTH, 1.3 + 0.46 * len(names))
     axes = figure.subplots()
     rows = np.arange(len(names))
-    axes.hlines(rows, every.min(axis=0), every.max(axis=0), color=PALE, linewidth=1.6, zorder=1)
-    for name, told in values.items():
+    for row in rows[::2]:  # bands hold each row's marks together
+        axes.axhspan(row - 0.5, row + 0.5, color=BAND, zorder=0, linewidth=0)
+    for shift, (name, told) in zip(
+        np.linspace(-APART, APART, len(values)), values.items(), strict=True
+    ):
         colour, mark = LOOKS[name]
         axes.plot(
-            told, rows, mark, color=colour, markersize=6.5, markeredgecolor="white",
+            told, rows + shift, mark, color=colour, markersize=6.5, markeredgecolor="white",
             markeredgewidth=0.6, label=labels[name], zorder=3,
         )  # fmt: skip
     shown = [float(every.min()), float(every.max())]

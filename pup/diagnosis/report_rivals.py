@@ -6,7 +6,7 @@ from pup.diagnosis import summary
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures_rivals import rival_dots
 from pup.diagnosis.rivals import DIAGNOSED, NETWORK, NN_PD, NOMINAL, Errors, Rivals
-from pup.diagnosis.wording import Speech, minus, percent, spoken
+from pup.diagnosis.wording import Speech, capital, minus, percent, spoken
 from pup.sysid.html import Column, Html, figure, table, tag
 from pup.sysid.wording import counted, listed, thousandths
 
@@ -49,13 +49,18 @@ def takeaway(errors: Mapping[str, Errors], speech: Speech) -> str:
     motions = list(errors[best].per_motion)
     wins = [m for m in motions if best == min(errors, key=lambda n: errors[n].per_motion[m])]
     others_told = listed(
-        [f"the {LABELS[name]}'s {thousandths(errors[name].overall)}" for name in others]
+        [f"{_named(name)}'s {thousandths(errors[name].overall)}" for name in others]
     )
     return (
-        f"The {LABELS[best]}'s error on motions left out is the smallest: "
+        f"{capital(_named(best))}'s error on motions left out is the smallest: "
         f"{thousandths(errors[best].overall)} {speech.units.small}, against {others_told}; it is "
         f"the best in {len(wins)} of {counted(len(motions), 'type')} of motion."
     )
+
+
+def _named(model: str) -> str:
+    """A model within a sentence."""
+    return LABELS[model] if model == NN_PD else f"the {LABELS[model]}"
 
 
 def _about(rivals: Rivals, speech: Speech) -> str:

@@ -106,6 +106,8 @@ def _trained(
 ) -> Any:
     """A network as it was when it did best on the blocks it was not trained on."""
     every = np.unique(blocks)
+    if len(every) < 2:  # nothing to train on beside what it is checked on
+        return _network(inputs.shape[1])
     kept = np.isin(blocks, rng.choice(every, max(1, round(SHARE * len(every))), replace=False))
     seen, aim, check, truth = (
         torch.tensor(part, dtype=torch.float32)
@@ -134,7 +136,7 @@ def _trained(
 
 
 def _network(inputs: int) -> Any:
-    """A network that tells nothing yet: where training leads nowhere, the simulation stands."""
+    """A network that tells nothing yet: where no step is a gain, the simulation stands."""
     last = torch.nn.Linear(HIDDEN, 1)
     torch.nn.init.zeros_(last.weight)
     torch.nn.init.zeros_(last.bias)

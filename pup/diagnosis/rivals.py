@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.fitting import Coordinate, Fit, differentiate, fit_together, nominal_coordinate
+from pup.diagnosis.fitting import Coordinate, Fit, fit_together, nominal_coordinate
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured
 from pup.diagnosis.selection import Selector
@@ -26,10 +26,8 @@ Array = NDArray[np.float64]
 NOMINAL, NN_PD, NETWORK, DIAGNOSED = "nominal", "nn_pd", "residual_network", "diagnosed"
 OUTPUTS = NETWORK_NAMES[15:]
 """Weights and biases of the network's last layer."""
-ITERATIONS, AGAIN = 16, 4
-"""Steps of the fit to all recordings, and of the fits without a fold, which start where it ends."""
-SLACK = 1e-3
-"""Relative gain of chi-squared at which these fits may end."""
+ITERATIONS, SLACK = 24, 1e-4
+"""Steps of NN-PD's fit, at most, and relative gain of chi-squared at which it may end."""
 LEAST = 0.1
 """Smallest scale of the active damping at the start: at none, a logarithm would stay there."""
 
@@ -99,17 +97,14 @@ def compare(
         return None
     from pup.diagnosis.residual_network import mend  # PyTorch is for those who ask for it
 
-    measured = found.measured
-    selector = Selector(
-        replays_with("pd"), found.noise, found.found, found.enough, found.nominal.fit
-    )
-    nominal, folds = selector.nominal, selector.folds
+    judge = Selector(replays_with("pd"), found.noise, (), 0.0, found.nominal.fit)
+    nominal = judge.nominal
     predicted, fit = {NOMINAL: nominal.predicted}, None
     if found.robot.network is not None:
-        predicted[NN_PD], fit = fit_nn_pd(found, replays_with("nn_pd"), folds)
-    predicted[NETWORK] = mend(measured, nominal.predicted, folds, seed)
+        predicted[NN_PD], fit = fit_nn_pd(found, replays_with("nn_pd"))
+    predicted[NETWORK] = mend(found.measured, nominal.predicted, judge.folds, seed)
     told = {
-        name: held_out(measured, replace(nominal, predicted=values), found.model, seed)
+        name: held_out(found.measured, replace(nominal, predicted=values), found.model, seed)
         for name, values in predicted.items()
     }
     errors = {name: _errors(held, 0) for name, held in told.items()}
@@ -120,48 +115,26 @@ def compare(
     )
 
 
-def fit_nn_pd(
-    found: Diagnosis, replays: Replays, folds: list[list[int]]
-) -> tuple[Array, tuple[float, float]]:
+def fit_nn_pd(found: Diagnosis, replays: Replays) -> tuple[Array, tuple[float, float]]:
     """Fit the paper's NN-PD to all recordings, then without each fold, and predict that.
 
-    A fit without a fold starts where the whole fit ends, with its Jacobian, so what it predicts is
-    rather too good than too bad.
+    A fit without a fold starts where the whole fit ends, as those of the diagnosis do, so what it
+    predicts is rather too good than too bad.
 
     Args:
       found: its nominal fit tells the start, its noise weighs the samples.
       replays: simulates with NN-PD.
-      folds: the recordings that are left out together.
 
     Returns:
       Predictions of each sample without its fold, shape (n_samples,), rad, and the joints' root
       mean square error on what was fitted, before and after, rad.
     """
-    measured, noise = found.measured, found.noise
     coordinates, start = _start(found, replays.space)
-    whole = Fit(coordinates, start, slack=SLACK)
-    fit_together([whole], replays, noise, ITERATIONS)
-    if whole.jacobian is None:
-        differentiate([whole], replays, noise)
-    without = [
-        Fit(
-            coordinates,
-            whole.at.copy(),
-            weight=np.where(measured.only(fold), 0.0, 1.0),
-            jacobian=whole.jacobian,
-            age=1,
-            thorough=False,
-            slack=SLACK,
-        )
-        for fold in folds
-    ]
-    fit_together(without, replays, noise, AGAIN)
-    asked = [([fit.row()], fold) for fit, fold in zip(without, folds, strict=True)]
-    predicted = measured.values.copy()
-    for fold, told in zip(folds, replays.together(asked), strict=True):
-        predicted[measured.only(fold)] = _known(told[0])
-    before, after = replays([whole.row(start), whole.row()])
-    return predicted, (_rms(measured, _known(before)), _rms(measured, _known(after)))
+    fit = Fit(coordinates, start, slack=SLACK)
+    fit_together([fit], replays, found.noise, ITERATIONS)
+    before, after = replays([fit.row(start), fit.row()])
+    predicted = Selector(replays, found.noise, (), 0.0, fit).nominal.predicted
+    return predicted, (_rms(found.measured, before), _rms(found.measured, after))
 
 
 def _start(found: Diagnosis, space: ParameterSpace) -> tuple[tuple[Coordinate, ...], Array]:
@@ -196,13 +169,10 @@ def _range(space: ParameterSpace, name: str) -> tuple[float, float]:
     return float(space.lower[i]), float(space.upper[i])
 
 
-def _known(simulated: Array) -> Array:
-    return np.where(np.isnan(simulated), LOST, simulated)
-
-
-def _rms(measured: Measured, predicted: Array) -> float:
+def _rms(measured: Measured, simulated: Array) -> float:
+    errors = measured.values - np.where(np.isnan(simulated), LOST, simulated)
     joints = measured.channel < len(measured.robot.joints)
-    return float(np.sqrt(np.mean((measured.values - predicted)[joints] ** 2)))
+    return float(np.sqrt(np.mean(errors[joints] ** 2)))
 
 
 def _errors(held: HeldOut, which: int) -> Errors:
