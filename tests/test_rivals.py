@@ -17,12 +17,14 @@ from diagnosis_cases import BENCH, recordings
 from test_report import Page
 
 from pup.diagnosis.replays import Bench, Replays, threads
-from pup.diagnosis.report_rivals import takeaway
-from pup.diagnosis.rivals import Errors, compare
+from pup.diagnosis.report_rivals import beside, takeaway
+from pup.diagnosis.rivals import Errors, Rivals, compare
 from pup.diagnosis.wording import Speech
 from pup.physics.parameters import robot_space
 from pup.recording import write_recordings
+from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits
+from pup.sysid.figures import drawing_style
 from services.diagnosis import alone, run_diagnosis
 
 FRICTION = {"coulomb_friction/torque@joint:servo": 0.03}
@@ -172,6 +174,19 @@ def test_the_takeaway_follows_the_numbers() -> None:
         "residual network's 3.0 and the nominal model's 6.0; it is the best in 1 of 2 types of "
         "motion."
     )
+
+
+def test_a_robot_of_several_joints_gets_a_table_of_them() -> None:
+    """Without a correction: its model is the nominal one, and stands there once."""
+    found = Maker(RobotDescription.load("darwin_leg"), ticks=20, most=2).nothing()
+    motions = dict.fromkeys(("step", "chirp", "hold"), 0.003)
+    told = Errors(0.003, motions, dict.fromkeys(found.robot.joint_names, 0.003))
+    rivals = Rivals(dict.fromkeys(MODELS, told), {}, (0.02, 0.01))
+    speech = Speech(found.robot, JointUnits.of(found.robot, found.measured.recordings))
+    with drawing_style():
+        text = "".join(beside(found, speech, rivals))
+    assert "The same by joint [mrad]" in text and "left knee" in text
+    assert "corrected model" not in text
 
 
 def test_nothing_to_compare_where_nothing_can_be_told(tmp_path: Path) -> None:
