@@ -82,6 +82,6 @@ def fitted(replays: Replays) -> tuple[Fit, Noise]:
 
 def settled(fit: Fit, replays: Replays, noise: Noise) -> Fit:
     """A fit taken to its minimum, with its Jacobian there."""
-    fit_together([fit], replays, noise, iterations=5)
+    fit_together([fit], replays, noise)
     differentiate([fit], replays, noise)
     return fit

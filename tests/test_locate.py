@@ -119,7 +119,7 @@ def test_a_drift_splits_early_from_late_until_it_is_in_the_model() -> None:
     early = next(s for s in splits(fit, replays, noise) if s.first == "late")
     kp = early.ratios[0]
     assert kp.parameter == "kp"
-    assert kp.value == pytest.approx(1 - 0.12 * 1.5, abs=0.06)
+    assert kp.value == pytest.approx(1 - 0.12 * 1.5, abs=0.08)  # told by one linear step
     assert early.chance < 1e-6
     assert early.gained is not None
     assert early.gained > 0.5 * early.promised

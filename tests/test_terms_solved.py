@@ -65,8 +65,9 @@ def lopsided(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]
 
 def integrating(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     q, v, total = x
-    torque = np.clip(KP * (target - q) + 15 * total - KD * v, -LIMIT, LIMIT)
-    return torque + weight(q), [target - q]
+    asked = KP * (target - q) + 15 * total - KD * v
+    wound = abs(asked) >= LIMIT and asked * (target - q) > 0
+    return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if wound else target - q]
 
 
 def dead(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
@@ -175,7 +176,7 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "torque_speed_limit": ({"slope": 0.3}, back_emf, (), INERTIA, 1e-4),
     "thermal_drift": ({"rate": 0.05}, drifting, (), INERTIA, 1e-4),
     "gain_asymmetry": ({"share": 0.2}, lopsided, (), INERTIA, 1e-4),
-    "integral_action": ({"gain": 15.0}, integrating, (0.0,), INERTIA, 1e-4),
+    "integral_action": ({"gain": 15.0}, integrating, (0.0,), INERTIA, 5e-4),
     "dead_band": ({"width": 0.01}, dead, (), INERTIA, 1e-4),
     "cogging": ({"sine": 0.03, "cosine": 0.02, "teeth": 24.0}, rippling, (), INERTIA, 1e-4),
     "joint_spring": ({"stiffness": 0.4, "preload": 0.1}, sprung, (), INERTIA, 1e-4),
