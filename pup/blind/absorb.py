@@ -8,7 +8,17 @@ import numpy as np
 
 from pup.blind.sensors import Noise, Seen, see
 from pup.blind.simulate import simulate
-from pup.blind.world import Array, Engine, Indices, Nominal, Plan, World, nominal_names
+from pup.blind.world import (
+    STEP,
+    Array,
+    Engine,
+    Indices,
+    Nominal,
+    Plan,
+    World,
+    nominal_names,
+    steady,
+)
 
 NUDGE = 0.04  # relative change of a parameter for its sensitivity
 COARSE = 10  # joints from which sensitivities take a coarser step
@@ -108,18 +118,19 @@ class Reference:
         """Simulate it.
 
         Args:
-          world: its effects and engine do not count.
+          world: its effects, integrator and solver do not count.
           plans: of the case.
           values: the nominal parameters by name.
         """
-        bare = replace(world, effects=(), engine=Engine())
+        nominal = Nominal.of(world.robot, values)
+        bare = replace(world, effects=(), engine=Engine(step=steady(nominal, STEP)))
         plans = unrepeated(plans)
         ground = any(plan.support == "ground" for plan in plans)
         names = nominal_names(world.robot, ground)
-        sets = [Nominal.of(world.robot, values)]
+        sets = [nominal]
         sets += [Nominal.of(world.robot, {**values, n: values[n] * (1 + NUDGE)}) for n in names]
         many = len(world.robot.joints) >= COARSE
-        coarse = replace(bare, engine=Engine(step=0.001)) if many else bare
+        coarse = replace(bare, engine=Engine(step=steady(nominal, 2 * STEP))) if many else bare
         found = readings(coarse, plans, sets)
         seen = readings(bare, plans)[0] if many else found[0]
         jacobian = {

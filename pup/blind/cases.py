@@ -10,6 +10,7 @@ from pup.blind.absorb import MATERIAL, Reference, Visibility, readings
 from pup.blind.catalogue import COMPARABLE, KINDS
 from pup.blind.drafts import Draft, draw_case, draw_null
 from pup.blind.sensors import Noise, measure
+from pup.blind.sound import check
 from pup.blind.world import Effect
 from pup.errors import InputError
 from pup.recording import Recording
@@ -30,7 +31,7 @@ FAINT = 4.0  # least SNR at which an effect counts as there
 CLEAR = 10.0  # SNR from which an effect below the noise is detectable without doubt
 HIDDEN = 0.5  # share absorbed from which an effect counts as masked
 ROUNDS = 2  # of a refit that is measured
-REDRAWS, TUNINGS, CALMINGS = 12, 4, 2
+REDRAWS, TUNINGS, CALMINGS = 30, 4, 2
 VERDICTS = ("mismatch", "none", "undetermined")
 
 
@@ -115,6 +116,7 @@ def _finished(draft: Draft, rng: np.random.Generator, id: str) -> Case | None:
         missed = draft.stratum in ("single", "masked") and stratum == "weak"
         if faint or missed or (len(each) > 1 and min(e.snr for e in each) < CLEAR):
             return None
+        check(draft, reference, seen)
         everything = alone
         if draft.nuisance:
             everything = reference.visibility(seen, draft.noise, rounds=ROUNDS)
@@ -148,7 +150,11 @@ def _calmed(draft: Draft) -> tuple[Draft, Mapping[str, Any], Visibility]:
 
 
 def _tuned(draft: Draft, reference: Reference) -> tuple[Draft, Mapping[str, Any], Visibility]:
-    """Bring the size into the stratum; the readings and what the effects alone do to them."""
+    """Bring the size into the stratum; the readings and what the effects alone do to them.
+
+    Raises:
+      InputError: it would take a size that no robot has.
+    """
     background = None
     if draft.nuisance:
         background = readings(replace(draft.world, effects=draft.nuisance), draft.plans)[0]
@@ -159,9 +165,7 @@ def _tuned(draft: Draft, reference: Reference) -> tuple[Draft, Mapping[str, Any]
         if factor == 1.0 or turn == TUNINGS:
             alone = reference.visibility(seen, draft.noise, background, ROUNDS)
             break
-        effects = tuple(effect.scaled(factor) for effect in draft.effects)
-        world = replace(draft.world, effects=effects)
-        draft = replace(draft, world=world, room=max(1.0, draft.room / factor))
+        draft = draft.resized(factor)
     return draft, seen, alone
 
 

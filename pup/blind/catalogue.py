@@ -55,6 +55,12 @@ COMPARABLE = frozenset(
 )
 """Effects whose size means the same in any sensible form."""
 
+LOSS = (0.00025, 0.0006)  # s, a material's damping over its stiffness; half a step keeps it stable
+
+USUAL = (0.05, 1.5)  # times typical: what is less is no omission, what is more no servo
+FIRM = (0.1, 1.5)  # of delays and springs: less is shorter than a step or stiffer than a link
+SLOW = (0.25, 1.5)  # of a limited rate: less is beyond what the motor can follow
+
 Shape = Callable[[np.random.Generator, Kit], Mapping[str, float]]
 
 
@@ -77,6 +83,7 @@ class Kind:
       where: `air`, `ground` or `both`.
       single: whether it makes sense on a single servo on a bench.
       besides: effects of other classes that come with it and are no mistake to name.
+      span: least and most of it that is plausible, times typical.
     """
 
     size_name: str
@@ -89,6 +96,7 @@ class Kind:
     where: str = "both"
     single: bool = True
     besides: tuple[str, ...] = ()
+    span: tuple[float, float] = USUAL
 
 
 def _direction(rng: np.random.Generator, level: bool = False) -> Mapping[str, float]:
@@ -106,7 +114,7 @@ def _late(rng: np.random.Generator, kit: Kit) -> Mapping[str, float]:
     wild = rng.uniform() < 0.4
     return {
         "jitter": float(rng.uniform(0.2, 0.5)) if wild else 0.0,
-        "lost": float(rng.uniform(0.0, 0.03)) if wild else 0.0,
+        "lost": float(rng.uniform(0.0, 2.5)) if wild else 0.0,  # share per second of delay
     }
 
 
@@ -114,14 +122,14 @@ def _sided(rng: np.random.Generator, kit: Kit) -> Mapping[str, float]:
     """Where the encoder sits, and how much the parts in series lose."""
     return {
         "side": 1.0 if rng.uniform() < 0.65 else -1.0,
-        "loss": 0.02 * kit.share * float(rng.uniform(0.5, 1.5)),
+        "loss": float(rng.uniform(*LOSS)),
         "drag": 0.002 * kit.share * float(rng.uniform(0.5, 1.5)),
     }
 
 
 def _bend(rng: np.random.Generator, kit: Kit) -> Mapping[str, float]:
     """A link bends about a level axis of its own; on the bench about the servo's."""
-    loss = {"loss": 0.02 * kit.share * float(rng.uniform(0.5, 1.5)), "root": 0.1}
+    loss = {"loss": float(rng.uniform(*LOSS)), "root": 0.1}
     if len(kit.robot.joints) == 1:
         return {"x": 0.0, "y": 1.0, "z": 0.0, **loss}
     angle = float(rng.uniform(0, np.pi))
@@ -132,6 +140,7 @@ def _speed(low: float, high: float) -> Shape:
     return lambda rng, kit: {"speed": kit.fast * float(rng.uniform(low, high))}
 
 
+ROUNDING = 1e-9  # relative, of numbers that were scaled
 JOINT = ("joint", "group")
 WIDE = ("joint", "group", "bus")
 TURN = 2 * np.pi
@@ -162,11 +171,13 @@ KINDS: dict[str, Kind] = {
     ),
     "torque_speed_limit": Kind("slope", "N m s/rad", lambda k: k.stall / k.fast, JOINT),
     "target_rate_limit": Kind(
-        "rate", "rad/s", lambda k: 4.0, WIDE, _of(haste=(15.0, 50.0)), inverse=True
+        "rate", "rad/s", lambda k: 4.0, WIDE, _of(run_up=(0.02, 0.06)), inverse=True, span=SLOW
     ),
-    "command_delay": Kind("delay", "s", lambda k: 0.012, WIDE, _late),
-    "measurement_delay": Kind("delay", "s", lambda k: 0.012, WIDE, _of(jitter=(0.0, 0.2))),
-    "actuator_lag": Kind("time constant", "s", lambda k: 0.01, JOINT),
+    "command_delay": Kind("delay", "s", lambda k: 0.012, WIDE, _late, span=FIRM),
+    "measurement_delay": Kind(
+        "delay", "s", lambda k: 0.012, WIDE, _of(jitter=(0.0, 0.2)), span=FIRM
+    ),
+    "actuator_lag": Kind("time constant", "s", lambda k: 0.01, JOINT, span=FIRM),
     "voltage_sag": Kind(
         "resistance",
         "ohm",
@@ -191,10 +202,10 @@ KINDS: dict[str, Kind] = {
     "dead_band": Kind("half width", "rad", lambda k: 0.004, JOINT),
     "backlash": Kind("half width", "rad", lambda k: 0.009, JOINT, _sided),
     "joint_compliance": Kind(
-        "stiffness", "N m/rad", lambda k: 120 * k.share, JOINT, _sided, inverse=True
+        "stiffness", "N m/rad", lambda k: 120 * k.share, JOINT, _sided, inverse=True, span=FIRM
     ),
     "structural_flex": Kind(
-        "stiffness", "N m/rad", lambda k: 150 * k.share, ("body",), _bend, inverse=True
+        "stiffness", "N m/rad", lambda k: 150 * k.share, ("body",), _bend, inverse=True, span=FIRM
     ),
     "integral_action": Kind("gain", "N m/(rad s)", lambda k: 2.0 * k.kp, JOINT),
     "gain_asymmetry": Kind("asymmetry", "1", lambda k: 0.085, ("joint",), signed=True),
@@ -334,6 +345,21 @@ def draw(name: str, kit: Kit, rng: np.random.Generator, places: tuple[str, ...] 
         form,
         kind.inverse,
     )
+
+
+def plausible(effect: Effect, kit: Kit) -> bool:
+    """Whether a robot may have so much of an effect.
+
+    A stop is: its angle comes from the motion, not from the catalogue.
+    """
+    if effect.name == "joint_stop":
+        return True
+    if effect.form in _UNLISTED:
+        typical, (least, most) = _UNLISTED[effect.form][2](kit), USUAL
+    else:
+        typical, (least, most) = KINDS[effect.name].typical(kit), KINDS[effect.name].span
+    much = typical / effect.size if effect.inverse else effect.size / typical
+    return least * (1 - ROUNDING) <= abs(much) <= most * (1 + ROUNDING)
 
 
 def unlisted() -> tuple[str, ...]:

@@ -59,17 +59,17 @@ def _arrivals(world: World, effect: Effect, plan: Plan) -> tuple[Array, Array]:
     waits = effect.size * (1 - effect.shape["jitter"]) + rng.exponential(
         effect.size * effect.shape["jitter"] + 1e-12, size=len(plan.time)
     )
-    kept = rng.uniform(size=len(plan.time)) >= effect.shape["lost"]
+    kept = rng.uniform(size=len(plan.time)) >= effect.shape["lost"] * effect.size
     kept[0] = True
     time: Array = np.maximum.accumulate((plan.time + waits)[kept])
     return time + 1e-7 * np.arange(len(time)), plan.target[kept]
 
 
 def _slewed(targets: Array, effect: Effect, step: float) -> Array:
-    """A firmware's ramp: limited rate, reached with a limited acceleration."""
+    """A firmware's ramp: limited rate, reached within the same way whatever the rate is."""
     out = targets.copy()
     rate = np.zeros_like(out[0])
-    acceleration = effect.shape["haste"] * effect.size
+    acceleration = effect.size**2 / (2 * effect.shape["run_up"])
     gain = acceleration * step
     for k in range(1, len(out)):
         ahead = targets[k] - out[k - 1]

@@ -44,13 +44,17 @@ class ActuatorLag(Part):
     """Current loop and winding, one after the other."""
 
     def begin(self) -> None:
-        """Both start at the first duty."""
-        self.share = -np.expm1(-2.0 * self.stage.step / self.size)
+        """Both start at the first duty; the mean delay of each is exact at any step."""
+        self.share = self.stage.step / (self.stage.step + self.size / 2)
         self.first = self.second = np.full(self.lanes, np.nan)
 
     def command(self, now: Moment) -> None:
-        """Delay the duty, within what the supply can give."""
-        duty = np.clip(now.duty[self.at], now.low[self.at], now.high[self.at])
+        """Delay the duty, within what the supply can give against the back-EMF.
+
+        These are the limits of the nominal law, so that without a lag it is the nominal one.
+        """
+        taken = now.loss[self.at] * now.speed[self.at]
+        duty = np.clip(now.duty[self.at], now.low[self.at] + taken, now.high[self.at] + taken)
         if np.isnan(self.first).any():
             self.first = self.second = duty
         self.first = self.first + self.share * (duty - self.first)
@@ -120,8 +124,8 @@ PARTS: dict[str, type[Part]] = {
     "gain_asymmetry": GainAsymmetry,
     "torque_speed_limit": TorqueSpeedLimit,
     "integral_action": IntegralAction,
-    "actuator_lag": ActuatorLag,
     "voltage_sag": VoltageSag,
     "thermal_drift": ThermalDrift,
+    "actuator_lag": ActuatorLag,
 }
-"""In the order in which they act: supply and heat last."""
+"""In the order in which they act: a lag is of what supply and heat leave."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pup.blind.absorb import readings
-from pup.blind.catalogue import CLASS_OF, KINDS, MASKED, available, draw, unlisted
+from pup.blind.catalogue import CLASS_OF, KINDS, MASKED, available, draw, plausible, unlisted
 from pup.blind.kit import Kit
 from pup.blind.programme import USUAL, Programme, programme
 from pup.blind.sensors import Noise
-from pup.blind.world import Effect, Engine, Nominal, Plan, World, nominal_names
+from pup.blind.world import STEP, Effect, Engine, Nominal, Plan, World, nominal_names, steady
 from pup.errors import InputError
 from pup.robot import RobotDescription
 
@@ -59,6 +59,19 @@ class Draft:
         """The robot with its nuisance."""
         return replace(self.world, effects=(*self.world.effects, *self.nuisance))
 
+    def resized(self, factor: float) -> "Draft":
+        """The same with `factor` times as much of the effects.
+
+        Raises:
+          InputError: no robot has so much or so little of them.
+        """
+        kit = Kit.of(self.world.robot, any(plan.support == "ground" for plan in self.plans))
+        effects = tuple(effect.scaled(factor) for effect in self.effects)
+        if not all(plausible(effect, kit) for effect in effects):
+            raise InputError("an effect of a size that no robot has")
+        world = replace(self.world, effects=effects)
+        return replace(self, world=world, room=max(1.0, self.room / factor))
+
 
 def _values(
     robot: RobotDescription, ground: bool, spread: float, rng: np.random.Generator
@@ -82,7 +95,8 @@ def _base(
 ) -> Draft:
     """Robot, sensors and plans, without effects; rough sensors have a memory and lose samples."""
     values = _values(robot, ground, spread, rng)
-    world = World(robot, Nominal.of(robot, values), seed=int(rng.integers(2**31)), engine=Engine())
+    nominal, seed = Nominal.of(robot, values), int(rng.integers(2**31))
+    world = World(robot, nominal, seed=seed, engine=Engine(step=steady(nominal, STEP)))
     noise = Noise(position=float(rng.uniform(0.001, 0.002)), imu=float(rng.uniform(0.001, 0.003)))
     if rough:
         noise = replace(

@@ -15,7 +15,9 @@ from pup.blind.world import Effect, Engine, Indices, Nominal, Plan, World
 from pup.errors import InputError
 
 FLOOR = "floor"
+GRAVITY = 9.81  # m/s2
 TEETH = (0.002, 1.0)  # s and damping ratio of gear teeth that meet
+HARD = (0.98, 0.995, 0.001, 0.5, 2.0)  # teeth hardly give way: play that is nil is none
 STICKY = (0.99, 0.9995, 0.001, 0.5, 2.0)  # dry friction hardly creeps
 FIRM = (0.002, 1.0)
 LEAST = 0.05  # of friction or damping that is left of a contact
@@ -121,11 +123,12 @@ def _equip(world: World, spec: mujoco.MjSpec, effect: Effect, support: str) -> N
             play = _second(spec, spec.joint(name), name, spec.joint(name).axis)
             play.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             play.range = (-effect.size, effect.size)
-            play.solref_limit, play.damping = TEETH, (effect.shape["drag"], 0, 0)
+            play.solref_limit, play.solimp_limit = TEETH, HARD
+            play.damping = (effect.shape["drag"], 0, 0)
     elif effect.name == "joint_compliance":
         for name in joints:
             spring = _second(spec, spec.joint(name), name, spec.joint(name).axis)
-            spring.stiffness, spring.damping = (effect.size, 0, 0), (effect.shape["loss"], 0, 0)
+            _stiffen(spring, effect)
     elif effect.name == "structural_flex":
         for name in effect.place.names:
             axis = tuple(effect.shape[a] for a in "xyz")
@@ -134,7 +137,7 @@ def _equip(world: World, spec: mujoco.MjSpec, effect: Effect, support: str) -> N
                 name=f"{name}:bends", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis
             )
             spring.pos = driven.pos if driven else (0, 0, effect.shape.get("root", 0.0))
-            spring.stiffness, spring.damping = (effect.size, 0, 0), (effect.shape["loss"], 0, 0)
+            _stiffen(spring, effect)
     elif effect.name == "joint_stop":
         for name in joints:
             joint = spec.joint(name)
@@ -157,6 +160,12 @@ def _second(
         armature=0.0,
         frictionloss=0.0,
     )
+
+
+def _stiffen(spring: mujoco.MjsJoint, effect: Effect) -> None:
+    """A material's losses grow with its stiffness, which also keeps the stiffest spring stable."""
+    spring.stiffness = (effect.size, 0, 0)
+    spring.damping = (effect.shape["loss"] * effect.size, 0, 0)
 
 
 def _lay_ground(world: World, spec: mujoco.MjSpec, effect: Effect) -> None:
@@ -184,13 +193,27 @@ def _lay_ground(world: World, spec: mujoco.MjSpec, effect: Effect) -> None:
                     touched.append(geom)
     for geom in touched:
         if effect.name == "ground_compliance":
-            # Sag of a mass at rest on this contact under gravity: (1 - d) / d g t^2 = size.
-            give = effect.shape["impedance"]
-            time = np.sqrt(effect.size * give / ((1 - give) * 9.81)) * give
-            geom.solref = (max(time, 2.2 * world.engine.step), effect.shape["damping"])
-            geom.solimp = (give, give, 0.001, 0.5, 2.0)
+            _soften(geom, effect, world.engine)
         elif effect.name == "contact_restitution":
-            geom.solref = (effect.shape["time"], max(1.0 - effect.size, LEAST))
+            own, share = world.engine.contact_time, min(effect.size, 1.0)
+            time = own + share * (effect.shape["time"] - own)
+            geom.solref = (time, max(1.0 - effect.size, LEAST))
+
+
+def _soften(geom: mujoco.MjsGeom, effect: Effect, engine: Engine) -> None:
+    """Let a mass at rest on this contact sag by so much more than on the nominal one.
+
+    At rest it sags by (1 - impedance) g (time constant x damping ratio)^2.
+    """
+    least, most = geom.solimp[:2]
+    own = (1.0 - most) * GRAVITY * engine.contact_time**2
+    share = effect.size / (effect.size + own)  # how far from the nominal contact
+    give = effect.shape["impedance"]
+    least, most = least + share * (give - least), most + share * (give - most)
+    damping = 1.0 + share * (effect.shape["damping"] - 1.0)
+    time = np.sqrt((own + effect.size) / ((1.0 - most) * GRAVITY)) / damping
+    geom.solref = (time, damping)
+    geom.solimp = (least, most, *geom.solimp[2:])
 
 
 def _series(world: World, model: mujoco.MjModel) -> list[tuple[int, int, bool]]:

@@ -167,7 +167,7 @@ def _tilt(world: World, time: Array, attitude: Array, ticks: Array) -> Array:
     angles = np.stack([np.arctan2(row[:, 1], row[:, 2]), -np.arcsin(np.clip(row[:, 0], -1, 1))])
     if late:  # half of it a transport delay, half a fusion filter
         step = time[1] - time[0]
-        share = -np.expm1(-2 * step / late)
+        share = step / (step + late / 2)
         for k in range(1, angles.shape[1]):
             angles[:, k] = angles[:, k - 1] + share * (angles[:, k] - angles[:, k - 1])
     at = np.clip(ticks - late / 2, time[0], time[-1])

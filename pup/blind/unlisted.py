@@ -8,6 +8,7 @@ from pup.blind.parts import Moment, Part
 from pup.blind.world import Array
 
 DITHER = 0.01  # s, one sweep of a driver's dither
+SWEEP = 0.7  # of a level, how far it sweeps
 ONSET = 0.3  # s, over which a changing friction changes
 
 
@@ -66,10 +67,11 @@ class QuantisedTorque(Part):
     """A driver with few levels and a dither."""
 
     def command(self, now: Moment) -> None:
-        """Round the duty."""
-        level = self.size
-        dither = (now.time / DITHER) % 1.0 - 0.5
-        now.duty[self.at] = np.round(now.duty[self.at] / level + 0.7 * dither) * level
+        """Round the duty, the mean over a kick as the dither sweeps on."""
+        duty = now.duty[self.at] / self.size + SWEEP * ((now.time / DITHER) % 1.0 - 0.5)
+        half = SWEEP * self.stage.step / DITHER / 2
+        swept = _stairs(duty + half) - _stairs(duty - half)
+        now.duty[self.at] = self.size * swept / (2 * half)
 
 
 class SpeedDependentGain(Part):
@@ -88,6 +90,12 @@ class FrictionStep(Part):
         """Grip from then on."""
         since = (now.time - self.shape["onset"]) / ONSET
         now.grip[self.at] += self.size / (1.0 + np.exp(-np.clip(4.0 * since, -30.0, 30.0)))
+
+
+def _stairs(height: Array) -> Array:
+    """The integral of rounding, from zero."""
+    level = np.round(height)
+    return np.asarray(level * height - level**2 / 2)
 
 
 FORMS: dict[str, type[Part]] = {

@@ -3,6 +3,7 @@
 SI units and radians throughout.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
+STEP = 0.0005  # s, of the truth
+STEADY = 0.8  # of a step times the rate of servo damping; from 1 on it is unstable
 SETTLING = 0.8  # s at rest before a recording on a fixed base, after the static sag is solved for
 SETTLING_ON_FEET = 1.5  # s
 
@@ -110,6 +113,13 @@ def nominal_names(robot: RobotDescription, ground: bool) -> tuple[str, ...]:
     return tuple(s.name for s in robot.parameters if s.name.partition("/")[0] in kinds)
 
 
+def steady(nominal: Nominal, step: float) -> float:
+    """A step, halved until even a rotor without a link is damped without ringing."""
+    rate = float(nominal.kd.max()) / nominal.armature
+    halvings = max(0, math.ceil(math.log2(step * rate / STEADY)))
+    return step * 0.5**halvings
+
+
 @dataclass(frozen=True)
 class Engine:
     """How the truth is integrated.
@@ -126,7 +136,7 @@ class Engine:
       contact_time: time constant of contacts, s.
     """
 
-    step: float = 0.0005
+    step: float = STEP
     integrator: str = "euler"
     predicted: bool = True
     native: bool = False

@@ -1,0 +1,168 @@
+"""What is concealed is physics: it vanishes with its size and does not hang on the time step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_blind_effects import plans, world_of
+
+from pup.blind.absorb import readings
+from pup.blind.catalogue import KINDS, available, draw, plausible, unlisted
+from pup.blind.drafts import NUISANCE, draw_case
+from pup.blind.kit import Kit
+from pup.blind.sensors import Noise
+from pup.blind.sound import converged, shrinks
+from pup.blind.world import STEP, Effect, Engine, Place, Plan, World, steady
+from pup.errors import InputError
+from pup.robot import RobotDescription
+
+QUIET = Noise(position=0.0, quantum=0.0)
+STEP_FREE = 2e-5  # rad, rms; the nominal motion itself changes as much with the step
+VANISHED, SAME = 0.05, 0.08  # shares of the change at typical size
+SWITCHED = 0.25  # the same of what jumps from level to level, at the next step at the earliest
+BRIEF = 30  # ticks, up to a moment without torque
+DISTAL = Place("joint", ("l_ank_roll",))  # carries the lightest link
+
+
+def moved(world: World, shown: list[Plan], *effects: Effect) -> np.ndarray:
+    seen = readings(replace(world, effects=effects), shown)[0]
+    return np.concatenate([seen[plan.id].stacked() for plan in shown])
+
+
+def shortened(plan: Plan) -> Plan:
+    enabled = None if plan.enabled is None else plan.enabled[:BRIEF]
+    return replace(plan, time=plan.time[:BRIEF], target=plan.target[:BRIEF], enabled=enabled)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def telling(effect: Effect) -> Effect:
+    """The same within the short motions of a test."""
+    if effect.name == "joint_stop":
+        return replace(effect, size=0.3 * effect.shape["side"])
+    shape = {"friction_step": {"onset": 0.3}, "stick_events": {"every": 0.2}}.get(effect.form)
+    return replace(effect, shape=shape) if shape else effect
+
+
+def typical(name: str, world: World) -> Effect:
+    effect = telling(draw(name, Kit.of(world.robot, False), np.random.default_rng(5)))
+    light = len(world.robot.joints) > 1 and effect.place.kind in ("joint", "group")
+    return replace(effect, place=DISTAL) if light else effect
+
+
+LEG = (
+    *("coulomb_friction", "quadratic_damping", "torque_speed_limit", "target_rate_limit"),
+    *("command_delay", "actuator_lag", "integral_action"),
+    *("backlash", "joint_compliance", "structural_flex"),
+)
+
+
+@pytest.mark.parametrize(("name", "names"), [("servo_bench", None), ("darwin_leg", LEG)])
+def test_effects_vanish_with_their_size_and_do_not_hang_on_the_step(
+    name: str, names: tuple[str, ...] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pup.blind.simulate.SETTLING", 0.1)
+    monkeypatch.setattr("pup.blind.simulate.SLOW", 0.1)
+    world = world_of(name)
+    fine = replace(world, engine=Engine(step=STEP / 8))
+    shown = [shortened(plan) for plan in plans(world.robot, "bench")]
+    nominal, exact = moved(world, shown), moved(fine, shown)
+    for effect in names or (*available(Kit.of(world.robot, False)), *unlisted()):
+        drawn = typical(effect, world)
+        change = moved(world, shown, drawn) - nominal
+        error = rms(change - (moved(fine, shown, drawn) - exact))
+        same = SWITCHED if drawn.form == "quantised_torque" else SAME
+        assert error < same * rms(change) + STEP_FREE, f"{effect}: off by {error:.1e} rad"
+        if effect == "joint_stop":  # its size is an angle
+            continue
+        left = rms(moved(world, shown, drawn.scaled(1e-3)) - nominal)
+        assert left < VANISHED * rms(change) + STEP_FREE, f"{effect}: {left:.1e} rad of nothing"
+
+
+def test_a_lag_of_nothing_is_none_beside_other_effects() -> None:
+    """Sagging and warm motors have other limits, within which a lag must stay."""
+    world = world_of("servo_bench")
+    shown = plans(world.robot, "bench")
+    others = [typical(name, world) for name in ("voltage_sag", "thermal_drift", "integral_action")]
+    lag = typical("actuator_lag", world).scaled(1e-6)
+    assert rms(moved(world, shown, *others, lag) - moved(world, shown, *others)) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["joint_compliance", "structural_flex", "backlash"])
+def test_the_stiffest_springs_of_a_nuisance_are_stable(name: str) -> None:
+    world = world_of("darwin_leg")
+    shown = plans(world.robot, "bench")
+    nominal = moved(world, shown)
+    for kept in (0.25, 1.0):  # a nuisance is halved up to twice
+        drawn = typical(name, world).scaled(kept * NUISANCE[0])
+        if name == "structural_flex":
+            drawn = replace(drawn, place=Place("body", ("l_ank_roll_link",)))
+        assert rms(moved(world, shown, drawn) - nominal) < 1e-3
+
+
+def test_effects_that_are_artefacts_are_told() -> None:
+    """One that grows as it should vanish, and one that is shorter than a step."""
+    world = world_of("servo_bench")
+    plan = replace(plans(world.robot, "bench")[1], enabled=None)
+    nominal = readings(world, [plan])[0][plan.id]
+
+    def verdicts(effect: Effect) -> tuple[bool, bool]:
+        seen = readings(replace(world, effects=(effect,)), [plan])[0][plan.id]
+        change = seen.stacked() - nominal.stacked()
+        return (
+            shrinks(world, plan, effect, nominal, change, QUIET),
+            converged(world, plan, effect, change, QUIET),
+        )
+
+    assert verdicts(typical("coulomb_friction", world)) == (True, True)
+    assert verdicts(replace(typical("joint_spring", world), inverse=True)) == (False, True)
+    late = replace(typical("command_delay", world), size=0.6 * STEP)
+    assert not verdicts(late)[1]
+
+
+@pytest.mark.parametrize("robot", ["servo_bench", "darwin_leg"])
+def test_no_draw_is_of_a_size_that_no_robot_has(
+    robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pup.blind.drafts._stopped", lambda draft, effect: effect)
+    description = RobotDescription.load(robot)
+    kit = Kit.of(description, False)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        for stratum in ("single", "below_noise", "weak", "masked", "pair", "unlisted"):
+            try:
+                draft = draw_case(description, stratum, False, rng)
+            except InputError:  # a pair of one class, drawn anew by the caller
+                continue
+            assert all(plausible(effect, kit) for effect in draft.effects)
+            for factor in 10 ** rng.uniform(-3, 3, size=4):
+                try:
+                    draft = draft.resized(float(factor))
+                except InputError:
+                    continue
+                assert all(plausible(effect, kit) for effect in draft.effects)
+
+
+def test_sizes_out_of_range_are_refused() -> None:
+    world = world_of("servo_bench")
+    kit = Kit.of(world.robot, False)
+    for name in (*available(kit), *unlisted()):
+        effect = draw(name, kit, np.random.default_rng(1))
+        least, most = KINDS[name].span if name in KINDS else (0.05, 1.5)
+        if name != "joint_stop":
+            assert plausible(effect.scaled(least), kit) and plausible(effect.scaled(most), kit)
+            assert not plausible(effect.scaled(0.9 * least), kit), name
+            assert not plausible(effect.scaled(1.1 * most), kit), name
+
+
+def test_a_light_rotor_with_much_damping_gets_a_smaller_step() -> None:
+    world = world_of("darwin_leg")
+    hard = replace(world.nominal, kd=1.6 * world.nominal.kd, armature=0.4 * world.nominal.armature)
+    assert steady(world.nominal, STEP) == STEP
+    assert steady(hard, STEP) < STEP
+    shown = plans(world.robot, "bench")
+    rough = replace(world, nominal=hard, engine=Engine(step=steady(hard, STEP)))
+    fine = replace(rough, engine=Engine(step=STEP / 8))
+    assert rms(moved(rough, shown) - moved(fine, shown)) < 5e-5
