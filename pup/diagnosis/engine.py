@@ -144,7 +144,6 @@ def diagnose(
     selector = Selector(replays, nominal.noise, found, enough, nominal.fit)
     progress("refits", 0.5)
     model, rounds = selector.run()
-    before = rounds[0].before if rounds else model
     if model.fit.jacobian is None:
         differentiate([model.fit], replays, nominal.noise)
     progress("what is left", 0.8)
@@ -154,7 +153,7 @@ def diagnose(
         "found": tuple(found),
         "enough": enough,
         "rounds": tuple(rounds),
-        "held_out": held_out(measured, before, final, seed),
+        "held_out": held_out(measured, selector.nominal, final, seed),
         "model": final,
         "unexplained": left,
     }

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.replays import Replays, Row
 from pup.physics.model import compile_model
-from pup.physics.terms import split_column
+from pup.physics.terms import Place, split_column
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
@@ -132,18 +132,14 @@ def _limbs_reached(
     name: str, robot: RobotDescription, limbs: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     told = split_column(name)
+    group = name.partition("/")[2]
+    place = Place("group", group) if group in robot.groups else Place("robot")
     if told is not None:
-        kind, place = told[2].kind, told[2].name
-    else:
-        group = name.partition("/")[2]
-        kind, place = ("group", group) if group in robot.groups else ("robot", "")
-    if kind == "joint":
-        return np.asarray(limbs[[robot.joint_names.index(place)]])
-    if kind == "group":
-        return np.asarray(limbs[robot.group_index == robot.groups.index(place)])
-    if kind == "body":
-        return np.asarray(limbs[_carrier(robot, place)])
-    return limbs
+        place = told[2]
+    if place.kind == "body":
+        return np.asarray(limbs[_carrier(robot, place.name)])
+    joints = place.joints(robot)
+    return np.asarray(limbs[joints]) if len(joints) else limbs
 
 
 def _carrier(robot: RobotDescription, body: str) -> NDArray[np.bool_]:
