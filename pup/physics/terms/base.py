@@ -181,6 +181,8 @@ class Term:
           torso: its orientation by the IMU, (n_simulations, 4); NaN where none was read.
         """
 
+    # The hooks below raise: a term overrides those it has, and `answers` keeps the others uncalled.
+
     def held(self, load: Array) -> None:
         """Take note, at the start, of what joints at rest need beside all torques told.
 
