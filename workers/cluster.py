@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 
 import ray
 from ray._private import ray_constants
+from ray._private import utils as ray_utils
 from ray._private import worker as ray_worker
 
 from pup.errors import InputError
@@ -53,12 +54,14 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
 def _joined(address: str) -> Iterator[None]:
     _probe(address)
     try:
-        with _own_signals():
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        told = " ".join(str(error).split())[:200]
-        raise InputError(f"--address {address}: no Ray cluster answers there ({told})") from error
-    try:
+        try:
+            with _own_signals():
+                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            told = " ".join(str(error).split())[:200]
+            raise InputError(
+                f"--address {address}: no Ray cluster answers there ({told})"
+            ) from error
         yield
     finally:
         ray.shutdown()
@@ -130,32 +133,40 @@ def _messages() -> Iterator[None]:
 
 @contextmanager
 def _own_signals() -> Iterator[None]:
-    """Keep this process's answers to Ctrl-C and SIGTERM while Ray starts.
+    """Keep Ctrl-C and SIGTERM until Ray has started; a second one is answered at once.
 
-    Ray puts one of its own in the place of that to SIGTERM. And a process that is just being forked
-    has these answers too: Ctrl-C reaches it as well, but is not for it.
+    Raised inside Ray's start they can be lost, and Ray would put an answer of its own in the place
+    of ours to SIGTERM. A process that is just being forked has these answers too: Ctrl-C reaches it
+    as well, but is not for it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    me, interrupt = os.getpid(), signal.getsignal(signal.SIGINT)
-    terminate = signal.getsignal(signal.SIGTERM)
+    me, asked = os.getpid(), list[int]()
+    usual = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def here(number: int, frame: FrameType | None) -> None:
-        if os.getpid() == me and callable(interrupt):
-            interrupt(number, frame)
+    def keep(number: int, frame: FrameType | None) -> None:
+        answer = usual[signal.Signals(number)]
+        if os.getpid() == me and asked and callable(answer):
+            answer(number, frame)
+        asked.append(number)
 
-    if callable(interrupt):
-        signal.signal(signal.SIGINT, here)
+    for number, answer in usual.items():
+        if callable(answer):
+            signal.signal(number, keep)
+    set_handler, ray_utils.set_sigterm_handler = ray_utils.set_sigterm_handler, _leave
     try:
         yield
-    except SystemExit:  # Ray's answer to SIGTERM
-        signal.signal(signal.SIGTERM, terminate)
-        signal.raise_signal(signal.SIGTERM)
-        raise
     finally:
-        signal.signal(signal.SIGINT, interrupt)
-        signal.signal(signal.SIGTERM, terminate)
+        ray_utils.set_sigterm_handler = set_handler
+        for number, answer in usual.items():
+            signal.signal(number, answer)
+    for number in asked[:1]:
+        signal.raise_signal(number)
+
+
+def _leave(handler: object) -> None:
+    """Set no answer to SIGTERM."""
 
 
 @contextmanager
