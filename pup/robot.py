@@ -119,6 +119,7 @@ class RobotDescription:
         feet = read_feet(table, model)
         parameters = read_parameters(table, groups, torso, model)
         network = read_network(table, parameters)
+        poses = read_poses(table, joints)
         robot = cls(
             name=table.name("name"),
             folder=folder.absolute(),
@@ -128,11 +129,11 @@ class RobotDescription:
             imu_site=read_imu_site(table, model),
             feet=feet,
             floating=model.floating is not None,
-            poses=read_poses(table, joints),
+            poses=poses,
             knobs=read_knobs(table, parameters, model),
             parameters=parameters,
             terms=read_terms(table, joints, groups, feet, model),
-            gait=read_gait(table, joints),
+            gait=read_gait(table, joints, poses, feet, model),
             network=network,
             actuator=read_actuator(table, network),
             timestep=read_timestep(table),

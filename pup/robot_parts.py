@@ -131,15 +131,32 @@ class Harmonics(NamedTuple):
 
 @dataclass(frozen=True)
 class Gait:
-    """A periodic reference motion.
+    """A periodic reference motion, and how a robot starts it and where it ends as fallen.
+
+    The defaults are those of the paper's authors (dart-env, DartDarwinSquat-v1).
 
     Attributes:
       period: s.
       joints: a series per joint of the robot, in joint order. It may pass the joint limits.
+      start: joint angles that the motion is taken up from, shape (n_joints,), rad; None for those
+        of phase 0.
+      start_pitch: of the torso at the start, rad; None for the one that lays the feet flat.
+      blend: time in which the angles of the start turn into those of phase 0, s.
+      tilt_limit: largest roll and pitch of a torso that has not fallen, rad.
+      drift_limit: largest way of the torso across the walking direction, or up or down, m.
+      ground_bodies: the bodies that may touch the floor.
+      imu_pitch_offset: what the IMU reports of the pitch is less than the pitch by this, rad.
     """
 
     period: float
     joints: dict[str, Harmonics]
+    start: tuple[float, ...] | None = None
+    start_pitch: float | None = None
+    blend: float = 0.2
+    tilt_limit: float = 1.0
+    drift_limit: float = 0.3
+    ground_bodies: tuple[str, ...] = ()
+    imu_pitch_offset: float = 0.0
 
     def angles(self, phase: ArrayLike) -> NDArray[np.float64]:
         """Joint angles, shape phase.shape + (n_joints,), rad, at phase = time / period."""

@@ -194,16 +194,54 @@ def read_network(table: Table, parameters: tuple[ParameterSpec, ...]) -> Network
     return network
 
 
-def read_gait(table: Table, joints: tuple[Joint, ...]) -> Gait | None:
+def read_gait(
+    table: Table,
+    joints: tuple[Joint, ...],
+    poses: dict[str, tuple[float, ...]],
+    feet: tuple[str, ...],
+    model: MjcfNames,
+) -> Gait | None:
     """Read the reference motion; joints it leaves out stay at 0."""
     if not table.has("gait"):
         return None
     section = table.table("gait")
-    period = section.number("period")
-    if period <= 0:
-        raise section.mistake("period", f"{period:g} s is not above 0")
-    entries = section.table("joints")
+    gait = Gait(
+        period=section.number("period"),
+        joints=_series(section.table("joints"), joints),
+        start=_start(section, poses),
+        start_pitch=section.number("start_pitch") if section.has("start_pitch") else None,
+        blend=section.number("blend", Gait.blend),
+        tilt_limit=section.number("tilt_limit", Gait.tilt_limit),
+        drift_limit=section.number("drift_limit", Gait.drift_limit),
+        ground_bodies=section.names("ground_bodies") or feet,
+        imu_pitch_offset=section.number("imu_pitch_offset", Gait.imu_pitch_offset),
+    )
     section.close()
+    if gait.period <= 0:
+        raise section.mistake("period", f"{gait.period:g} s is not above 0")
+    if gait.blend < 0:
+        raise section.mistake("blend", f"{gait.blend:g} s is negative")
+    for key in ("tilt_limit", "drift_limit"):
+        if getattr(gait, key) <= 0:
+            raise section.mistake(key, f"{getattr(gait, key):g} is not above 0")
+    for body in gait.ground_bodies:
+        if body not in model.bodies:
+            raise section.mistake("ground_bodies", absent("body", body))
+    return gait
+
+
+def _start(section: Table, poses: dict[str, tuple[float, ...]]) -> tuple[float, ...] | None:
+    """The pose a gait is taken up from."""
+    if not section.has("start"):
+        return None
+    name = section.text("start")
+    if name not in poses:
+        known = listed(poses) or "none"
+        raise section.mistake("start", f"there is no pose {name!r}; poses: {known}")
+    return poses[name]
+
+
+def _series(entries: Table, joints: tuple[Joint, ...]) -> dict[str, Harmonics]:
     series = {}
     for joint in joints:
         if not entries.has(joint.name):
@@ -217,4 +255,4 @@ def read_gait(table: Table, joints: tuple[Joint, ...]) -> Gait | None:
         series[joint.name] = harmonics
     for name in entries.left():
         raise entries.mistake(name, "there is no such joint; remove it or correct the name")
-    return Gait(period, series)
+    return series

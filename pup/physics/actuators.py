@@ -6,7 +6,7 @@ damping over a light link's inertia is stiffer than any step worth taking (0.7 N
 3e-4 kg m² asks for 0.4 ms); taken implicitly, 2 ms is stable and the small-step limit is the same.
 """
 
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,10 @@ class TorqueLaw(Protocol):
         """
         ...
 
+    def renew(self, rows: NDArray[np.int64], other: Self) -> None:
+        """Give some simulations the parameters of another law, which has one row for each."""
+        ...
+
 
 class PD:
     """Torque clip(kp (target - q) - kd qdot, ±tau_max), per joint group (CONTRACTS.md, section 2).
@@ -60,7 +64,7 @@ class PD:
         self.kp = per_joint(robot, candidates, "kp")
         self.kd = per_joint(robot, candidates, "kd")
         self.limit = per_joint(robot, candidates, "tau_max")
-        self.armature = candidates["armature"][:, None] if "armature" in candidates else None
+        self.armature = candidates["armature"][:, None].copy() if "armature" in candidates else None
         self.passive = 0.0
         self.steady = True
 
@@ -68,6 +72,12 @@ class PD:
         """See TorqueLaw."""
         n = len(error)
         return self.kp[:n] * error, self.kd[:n].copy()
+
+    def renew(self, rows: NDArray[np.int64], other: Self) -> None:
+        """See TorqueLaw."""
+        self.kp[rows], self.kd[rows], self.limit[rows] = other.kp, other.kd, other.limit
+        if self.armature is not None:
+            self.armature[rows] = other.armature
 
 
 class NetworkPD:
@@ -97,7 +107,7 @@ class NetworkPD:
         self.b_out = weights[25:27] / 2
         halves = rho * (options.kp_scale / 2), sigma * (options.kd_scale / 2)
         self.scale = np.stack(halves).astype(np.float32)
-        self.limit = candidates["torque_limit"][:, None]
+        self.limit = candidates["torque_limit"][:, None].copy()
         self.passive = options.passive_damping
         self.steady = False
         self.armature = np.full((1, 1), options.armature) if options.armature else None
@@ -128,6 +138,13 @@ class NetworkPD:
         torque, damping = self.gains(error, velocity)
         torque *= error
         return torque, damping
+
+    def renew(self, rows: NDArray[np.int64], other: Self) -> None:
+        """See TorqueLaw; the armature is the same for all."""
+        self.w_error[:, rows], self.w_speed[:, rows] = other.w_error, other.w_speed
+        self.bias[:, rows] = other.bias
+        self.w_out[:, :, rows], self.b_out[:, rows] = other.w_out, other.b_out
+        self.scale[:, rows], self.limit[rows] = other.scale, other.limit
 
 
 def per_joint(robot: RobotDescription, candidates: Candidates, kind: str) -> Array:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def implicit_share(damping: Array, inertia: Array, timestep: float) -> Array:
+def implicit_share(damping: Array, inertia: Array, timestep: float | Array) -> Array:
     """Share of a viscous torque to be taken implicitly, for one inertia exact whatever the step.
 
     Of `inertia * dv/dt = -damping * v` a step that takes the share 1/(1 - exp(-x)) - 1/x, with
@@ -16,7 +16,7 @@ def implicit_share(damping: Array, inertia: Array, timestep: float) -> Array:
     Args:
       damping: viscous coefficients, N m s/rad.
       inertia: what they brake, same shape, kg m².
-      timestep: s.
+      timestep: s; one for all, or broadcastable to the rest.
     """
     x = np.maximum(damping * (timestep / inertia), 1e-6)
     return np.asarray(-1 / np.expm1(-x) - 1 / x)

@@ -1,5 +1,6 @@
 """From a robot's description to a compiled MuJoCo model, and the pose a recording starts in."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -45,8 +46,11 @@ class Model:
     contacts: tuple[tuple[int, int], ...]
 
 
+Extension = Callable[[RobotDescription, mujoco.MjSpec], None]
+
+
 @lru_cache(maxsize=32)
-def compile_model(robot: RobotDescription, support: str) -> Model:
+def compile_model(robot: RobotDescription, support: str, extend: Extension | None = None) -> Model:
     """Compile a robot for one kind of support.
 
     Suspended, the torso is fixed and nothing touches; on the ground it is free; on the bench the
@@ -55,6 +59,7 @@ def compile_model(robot: RobotDescription, support: str) -> Model:
     Args:
       robot: the robot.
       support: `suspended`, `ground` or `bench`.
+      extend: adds to the model, such as sensors.
 
     Raises:
       InputError: MuJoCo refuses the model, or the robot cannot stand on that support.
@@ -69,12 +74,16 @@ def compile_model(robot: RobotDescription, support: str) -> Model:
         if support == "suspended":
             for joint in free:
                 spec.delete(joint)
+        for body in spec.bodies[1:]:
+            body.simple = False  # a body on a slide could not have its centre of mass moved
         spec.option.timestep = robot.timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         if support == "ground":
             _floor_under_the_feet(robot, spec)
         else:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        if extend is not None:
+            extend(robot, spec)
         compiled = spec.compile()
     except ValueError as error:
         raise InputError(f"{robot.model_path}: MuJoCo refuses it: {_one_line(error)}") from error
@@ -92,6 +101,19 @@ def compile_model(robot: RobotDescription, support: str) -> Model:
         floating,
         _contacts(robot, compiled),
     )
+
+
+def joint_inertia(model: Model, armature: Array | None, shape: tuple[int, ...]) -> Array:
+    """What each joint's torque accelerates at the model's reference pose, kg m².
+
+    Args:
+      model: the compiled model.
+      armature: rotor inertia of the torque law, broadcastable to `shape`; None keeps the model's.
+      shape: (n_simulations, n_joints).
+    """
+    own = model.compiled.dof_armature[model.dofs]
+    rotor = np.broadcast_to(own if armature is None else armature, shape)
+    return np.asarray(model.compiled.dof_M0[model.dofs] - own + rotor)
 
 
 def _contacts(robot: RobotDescription, model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
@@ -172,7 +194,7 @@ def standing_qpos(robot: RobotDescription, model: Model, position: Array, torso:
     mujoco.mj_kinematics(model.compiled, data)
     data.qpos[3:7] = _feet_flat(robot, model.compiled, data) if np.isnan(torso).any() else torso
     mujoco.mj_kinematics(model.compiled, data)
-    data.qpos[2] -= _lowest_point(model.compiled, data)
+    data.qpos[2] -= lowest_point(model.compiled, data.geom_xpos, data.geom_xmat)
     return np.array(data.qpos)
 
 
@@ -200,14 +222,19 @@ def _feet_flat(robot: RobotDescription, model: mujoco.MjModel, data: mujoco.MjDa
     return np.asarray(half / np.linalg.norm(half))
 
 
-def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Height of the lowest corner of the robot's colliding geoms, m."""
-    lowest = np.inf
-    for geom in range(model.ngeom):
-        collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
-        if model.geom_bodyid[geom] == 0 or not collides:
-            continue
-        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-        row = data.geom_xmat[geom].reshape(3, 3)[2]
-        lowest = min(lowest, data.geom_xpos[geom, 2] + row @ centre - np.abs(row) @ half)
-    return float(lowest) if np.isfinite(lowest) else 0.0
+def lowest_point(model: mujoco.MjModel, places: Array, axes: Array) -> Array:
+    """Height of the lowest corner of the robot's colliding geoms, shape (...,), m.
+
+    Args:
+      model: the compiled model.
+      places: of all geoms, shape (..., n_geoms, 3), m: `geom_xpos`.
+      axes: their rotation matrices, shape (..., n_geoms, 9): `geom_xmat`.
+    """
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = np.flatnonzero(collides & (model.geom_bodyid != 0))
+    if not len(geoms):
+        return np.zeros(places.shape[:-2])
+    centre, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
+    up = axes[..., geoms, 6:]  # what each geom's axes have of the vertical
+    corner = (up * centre).sum(axis=-1) - (np.abs(up) * half).sum(axis=-1)
+    return np.asarray((places[..., geoms, 2] + corner).min(axis=-1))

@@ -15,7 +15,7 @@ from pup.physics.actuators import LAWS, TorqueLaw
 from pup.physics.commands import Commands
 from pup.physics.encoders import Event, History
 from pup.physics.fields import apply_fields, scaled
-from pup.physics.model import Model, compile_model, first_tilt, standing_qpos
+from pup.physics.model import Model, compile_model, first_tilt, joint_inertia, standing_qpos
 from pup.physics.parameters import Candidates
 from pup.physics.push import Push, Pushing
 from pup.physics.rotations import multiply, roll_pitch
@@ -391,7 +391,7 @@ def _scene(robot: RobotDescription, model: Model, law: TorqueLaw, shape: tuple[i
     """What the terms of a batch know of their simulations."""
     own = model.compiled.dof_armature[model.dofs]
     armature = np.broadcast_to(own if law.armature is None else law.armature, shape).copy()
-    inertia = model.compiled.dof_M0[model.dofs] - own + armature
+    inertia = joint_inertia(model, law.armature, shape)
     return Scene(robot, model, robot.timestep, inertia, armature, np.broadcast_to(law.limit, shape))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pup.physics.actuators import TorqueLaw
 from pup.physics.commands import Commands, Target
-from pup.physics.implicit import implicit_share
+from pup.physics.limited import LimitedLaw
 from pup.physics.terms.base import Drive, Flow, Scene, Term
 
 Array = NDArray[np.float64]
@@ -46,6 +46,7 @@ class Servos:
         candidates: int,
     ) -> None:
         self.law = law
+        self.limited = LimitedLaw(law, scene.inertia, viscous, scene.timestep)
         self.commands = commands
         self.power = None if (power == 1).all() else power
         self.scene = scene
@@ -60,15 +61,6 @@ class Servos:
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self._before: Array | None = None
-        self._last: tuple[Array, Array, Array] | None = None
-        self._inertia = scene.inertia / scene.timestep
-        still = np.zeros_like(scene.inertia)
-        self._share = np.ones_like(still)
-        if law.steady:
-            own = law.unlimited(still, still)[1]
-            self._share = implicit_share(own, scene.inertia, scene.timestep)
-            self._free, self._held = self._damped(own), self._damped(still)
-        self._reach = self._share / self._inertia
         self.loaded = any(term.loaded for term in self.flowing)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
@@ -100,7 +92,7 @@ class Servos:
         time = step * self.scene.timestep
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
-        outside = None if still else self._outside(step, sensed[1])
+        outside = None if still or step == 0 else self.limited.outside(sensed[1])
         error, torque, damping = self._answer(target.now, sensed, outside, time)
         if target.before is not None:
             share = self._spread(target.share, running)
@@ -113,7 +105,7 @@ class Servos:
             torque *= on
             damping *= on
         if not still:
-            self._last = sensed[1].copy(), torque, damping
+            self.limited.keep(sensed[1], torque, damping)
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
         if self.flowing:
@@ -125,61 +117,11 @@ class Servos:
             damping *= implicit
         return torque, damping
 
-    def _outside(self, step: int, velocity: Array) -> Array | None:
-        """Torque beside the servos', N m, by what the last sub-step did; None before the first."""
-        if step == 0 or self._last is None:
-            return None
-        n = len(velocity)
-        before, torque, damping = (a[:n] for a in self._last)
-        gained = velocity - before
-        met = velocity  # by what is taken implicitly
-        if self.law.steady:
-            met = gained * self._share[:n]
-            met += before
-        braked = damping * met
-        gained *= self._inertia[:n]
-        gained += braked
-        gained -= torque
-        return gained
-
-    def _ahead(
-        self, torque: Array, damping: Array, velocity: Array, outside: Array | None
-    ) -> Array:
-        """The velocity that damping meets in a sub-step, by each joint's own inertia.
-
-        Whether a servo is at its limit is decided by it. Decided by the velocity that is, a servo
-        would leave its limit with a jump of its torque, by what a sub-step changes of the damping,
-        and trajectories would jump with whatever moves that moment past a sub-step's end. Stiff
-        damping brakes within the sub-step: velocities that only go on as they did would mislead.
-        """
-        if outside is None:
-            return velocity
-        reach = self._reach[: len(velocity)]
-        ahead = torque + outside
-        ahead *= reach
-        ahead += velocity
-        slower = reach * damping
-        slower += 1
-        ahead /= slower
-        return ahead
-
-    def _damped(self, servo: Array) -> tuple[Array, Array]:
-        """All damping with some of the servos, and the share that a sub-step takes implicitly."""
-        total = servo + self.viscous
-        return total, implicit_share(total, self.scene.inertia, self.scene.timestep)
-
     def _implicit(self, damping: Array, still: bool) -> Array | None:
         """Share of a damping that the engine takes implicitly; None where it takes all of it."""
         if still:
             return np.zeros_like(damping)
-        if not self.law.steady:
-            return None
-        n = len(damping)
-        free, held = self._free[0][:n], self._held[0][:n]
-        off_limit = damping == free
-        if (off_limit | (damping == held)).all():  # as it mostly is, without exponentials
-            return np.where(off_limit, self._free[1][:n], self._held[1][:n])
-        return implicit_share(damping, self.scene.inertia[:n], self.scene.timestep)
+        return self.limited.implicit(damping)
 
     def _through_gears(
         self,
@@ -246,25 +188,17 @@ class Servos:
             error = target - position
         for term in self.erring:
             error = term.error(error)
+        if not self.driving:
+            return error, *self.limited.answer(error, velocity, outside)
         torque, damping = self.law.unlimited(error, velocity)
         limit = self.law.limit[: len(error)]
-        if not self.driving:
-            _clip(torque, damping, self._ahead(torque, damping, velocity, outside), limit)
-            return error, torque, damping
         upper = np.broadcast_to(limit, error.shape).copy()
         drive = Drive(time, error, velocity, torque, upper, -upper, np.zeros_like(upper))
         for term in self.driving:
             term.drive(drive)
-        _clip_between(drive, damping, self._ahead(drive.torque, damping, velocity, outside))
+        ahead = self.limited.ahead(drive.torque, damping, velocity, outside)
+        _clip_between(drive, damping, ahead)
         return error, drive.torque, damping
-
-
-def _clip(torque: Array, damping: Array, ahead: Array, limit: Array) -> None:
-    """Clip `torque - damping * ahead` to ±limit, in place; clipped, nothing is left to damp."""
-    total = torque - damping * ahead
-    clipped = ~(np.abs(total) < limit)
-    np.copysign(limit, total, out=torque, where=clipped)
-    np.copyto(damping, 0.0, where=clipped)
 
 
 def _clip_between(drive: Drive, damping: Array, ahead: Array) -> None:

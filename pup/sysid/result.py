@@ -179,3 +179,46 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
         if not np.isfinite(value):
             raise InputError(f"{path}: parameter {name!r} is {value}; expected a finite number")
     return kind, space.at(values)
+
+
+@dataclass(frozen=True)
+class FittedBounds:
+    """Bounds to draw parameters from.
+
+    Attributes:
+      actuator: torque law, `nn_pd` or `pd`.
+      space: all of the robot's parameters for it, with the fitted values as the nominal ones.
+      names: the bounded parameters.
+      lower: their lower bounds, physical, shape (n_bounded,).
+      upper: upper bounds, not below the lower ones.
+    """
+
+    actuator: Actuator
+    space: ParameterSpace
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+
+
+def read_bounds(path: Path, robot: RobotDescription) -> FittedBounds:
+    """Read a `bounds.json` or `identified.json` as a box around a fitted point.
+
+    Raises:
+      InputError: as `read_fitted`, and bounds that are absent, not finite or the wrong way round.
+    """
+    actuator, space = read_fitted(path, robot)
+    names, lower, upper = [], [], []
+    for entry in read_json(path)["parameters"]:
+        name = entry["name"]
+        try:
+            low, high = float(entry["lower"]), float(entry["upper"])
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"{path}: parameter {name!r} has no bounds lower and upper") from error
+        if not -np.inf < low <= high < np.inf:
+            raise InputError(f"{path}: parameter {name!r}: [{low:g}, {high:g}] are no bounds")
+        names.append(name)
+        lower.append(low)
+        upper.append(high)
+    if not names:
+        raise InputError(f"{path}: no bounded parameter in it")
+    return FittedBounds(actuator, space, tuple(names), np.array(lower), np.array(upper))

@@ -1,0 +1,1 @@
+"""Walking: the task that policies are trained on, batched."""
