@@ -1,0 +1,1 @@
+"""Policies: their networks, their symmetry, and the bundle that a robot's computer runs."""

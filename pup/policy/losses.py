@@ -1,0 +1,163 @@
+"""What a policy is trained with: advantages, PPO's losses and the mirror loss."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pup.policy.mirror import MirrorMap
+from pup.policy.network import ProjectedPolicy, log_probability
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the losses.
+
+    Attributes:
+      clip: largest change of a probability ratio that is followed (Schulman et al. 2017).
+      value: of half the squared error of values.
+      entropy: of the policy's entropy per joint.
+      mirror: of the squared distance, summed over bins and averaged over joints, between a state's
+        probabilities and the mirrored ones of the mirrored state; both are moved (Yu et al. 2018,
+        there on means with weight 4). 0 for none.
+    """
+
+    clip: float = 0.2
+    value: float = 1.0
+    entropy: float = 0.0
+    mirror: float = 1.0
+
+
+class Samples(NamedTuple):
+    """Transitions of a minibatch; n of them.
+
+    Attributes:
+      proprioception: shape (n, n_entries).
+      parameters: mu as given to the policy, shape (n, n_parameters).
+      true_parameters: shape (n, n_parameters).
+      bins: actions, shape (n, joints).
+      log: logarithm of the actions' probability when they were drawn, shape (n,).
+      advantages: normalised, shape (n,).
+      returns: normalised, shape (n,).
+    """
+
+    proprioception: Tensor
+    parameters: Tensor
+    true_parameters: Tensor
+    bins: Tensor
+    log: Tensor
+    advantages: Tensor
+    returns: Tensor
+
+
+class Losses(NamedTuple):
+    """Scalars.
+
+    Attributes:
+      total: what is descended.
+      policy: of PPO's surrogate.
+      value: half the mean squared error, in variances of the returns.
+      mirror: unweighted.
+      entropy: per joint, nats.
+      kl: divergence from the policy that drew the actions, nats; Schulman's estimate.
+      clipped: share of samples whose ratio is beyond the clip.
+    """
+
+    total: Tensor
+    policy: Tensor
+    value: Tensor
+    mirror: Tensor
+    entropy: Tensor
+    kl: Tensor
+    clipped: Tensor
+
+
+class TorchMirror:
+    """A mirror map for tensors.
+
+    Args:
+      mirror: the map.
+      device: where the tensors are.
+    """
+
+    def __init__(self, mirror: MirrorMap, device: str = "cpu") -> None:
+        self.entries, self.signs, self.parameters, self.logits = (
+            torch.from_numpy(told).to(device)
+            for told in (mirror.entries, mirror.signs, mirror.parameters, mirror.logits)
+        )
+
+    def observation(self, proprioception: Tensor) -> Tensor:
+        """The mirrored robot's observation, same shape."""
+        return proprioception[:, self.entries] * self.signs
+
+    def probabilities(self, told: Tensor) -> Tensor:
+        """Mirrored probabilities, shape (n, bins, joints)."""
+        return told.flatten(-2)[:, self.logits].view_as(told)
+
+
+def losses(
+    policy: ProjectedPolicy, samples: Samples, weights: LossWeights, mirror: TorchMirror | None
+) -> Losses:
+    """PPO's losses and the mirror loss of a minibatch."""
+    count = len(samples.log)
+    seen, parameters = samples.proprioception, samples.parameters
+    if mirror is None or not weights.mirror:
+        log = torch.log_softmax(policy(seen, parameters), dim=-2)
+        told = log.exp()
+        apart = told.new_zeros(())
+    else:  # one pass for both: small layers are mostly overhead
+        seen = torch.cat([seen, mirror.observation(seen)])
+        parameters = torch.cat([parameters, parameters[:, mirror.parameters]])
+        log = torch.log_softmax(policy(seen, parameters), dim=-2)
+        told = log.exp()
+        off = told[count:] - mirror.probabilities(told[:count])
+        apart = off.square().sum() / (count * policy.shape.joints)
+        log, told = log[:count], told[:count]
+    change = log_probability(log, samples.bins) - samples.log
+    ratio = change.exp()
+    kept = ratio.clamp(1 - weights.clip, 1 + weights.clip)
+    surrogate = -torch.minimum(ratio * samples.advantages, kept * samples.advantages).mean()
+    entropy = -(told * log).sum() / (count * policy.shape.joints)
+    error = policy.value(samples.proprioception, samples.true_parameters) - samples.returns
+    value = 0.5 * error.square().mean()
+    total = surrogate + weights.value * value + weights.mirror * apart - weights.entropy * entropy
+    with torch.no_grad():
+        kl = (ratio - 1 - change).mean()
+        clipped = (ratio != kept).float().mean()
+    return Losses(total, surrogate, value, apart, entropy, kl, clipped)
+
+
+def advantages(
+    rewards: Array,
+    values: Array,
+    terminated: NDArray[np.bool_],
+    truncated: NDArray[np.bool_],
+    discount: float,
+    decay: float,
+) -> Array:
+    """Generalised advantage estimates (Schulman et al. 2016), shape (T, N).
+
+    Where an episode ends, the next slot is its simulation's reset: no transition, with a reward of
+    0, and nothing flows back from it. Its value still is that of the episode's last state.
+
+    Args:
+      rewards: of steps, shape (T, N).
+      values: of the states before each step and after the last, shape (T + 1, N).
+      terminated: ends without a future, shape (T, N).
+      truncated: ends by the clock, whose future the value tells, shape (T, N).
+      discount: of the future, gamma.
+      decay: lambda.
+    """
+    errors = rewards + discount * values[1:] * ~terminated - values[:-1]
+    carried = discount * decay * ~(terminated | truncated)
+    told = np.empty_like(errors)
+    ahead = np.zeros_like(errors[0])
+    for t in reversed(range(len(errors))):
+        ahead = errors[t] + carried[t] * ahead
+        told[t] = ahead
+    return told

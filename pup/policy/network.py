@@ -1,0 +1,161 @@
+"""Projection, policy and value function (paper, section IV), in plain torch.
+
+Logits have the layout (batch, bins, joints), **bins-major**, everywhere: a softmax over the middle
+axis of so small a block is several times as fast as over the last one. In a weight matrix or where
+they are flat, the logit of bin b at joint j stands at b * joints + j.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from pup.policy.shape import PolicyShape
+
+CLIP = 5.0
+"""Standard deviations at which normalised observations end (the authors' filter)."""
+FLOOR = 1e-6
+"""Least variance; an entry that never changes stays near 0."""
+
+
+class Normaliser(torch.nn.Module):
+    """Running mean and variance of what it is shown, in buffers.
+
+    Args:
+      size: entries of a sample.
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+
+    @property
+    def scale(self) -> Tensor:
+        """Standard deviations, shape (size,)."""
+        return self.variance.clamp(min=FLOOR).sqrt()
+
+    def forward(self, samples: Tensor) -> Tensor:
+        """Samples with mean 0 and variance 1, clipped; shape (..., size)."""
+        return ((samples - self.mean) / self.scale).clamp(-CLIP, CLIP)
+
+    @torch.no_grad()
+    def update(self, samples: Tensor) -> None:
+        """Take samples, shape (n, size), into account (Chan, Golub and LeVeque 1979)."""
+        added = samples.shape[0]
+        total = self.count + added
+        variance, mean = torch.var_mean(samples, dim=0, correction=0)
+        off = mean - self.mean
+        share = added / total
+        self.variance.mul_(1 - share).add_(share * (variance + (1 - share) * off**2))
+        self.mean.add_(share * off)
+        self.count.copy_(total)
+
+
+class ProjectedPolicy(torch.nn.Module):
+    """A policy conditioned on eta, the projection of mu to it, and a value function.
+
+    The value function sees the true mu in place of eta: it is used in training alone, where mu is
+    known. Its values are in units of the standard deviation of returns.
+
+    Args:
+      shape: sizes.
+    """
+
+    def __init__(self, shape: PolicyShape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.observations = Normaliser(shape.proprioception)
+        self.returns = Normaliser(1)
+        if shape.latent:
+            self.projection = _layers(shape.parameters, shape.projection, shape.latent, 1.0)
+        self.actor = _layers(
+            shape.proprioception + shape.eta, shape.hidden, shape.bins * shape.joints, 0.01
+        )
+        self.critic = _layers(shape.proprioception + shape.privileged, shape.hidden, 1, 1.0)
+
+    def project(self, parameters: Tensor) -> Tensor:
+        """What the policy is conditioned on, shape (n, eta).
+
+        Args:
+          parameters: mu on the unit scale of the bounds, shape (n, n_parameters); not looked at
+            by a policy that sees none.
+        """
+        centred = 2 * parameters - 1
+        if self.shape.latent:
+            return torch.tanh(self.projection(centred))
+        return centred[..., : self.shape.eta]
+
+    def logits(self, proprioception: Tensor, eta: Tensor) -> Tensor:
+        """Logits of the bins, shape (n, bins, joints)."""
+        flat = self.actor(torch.cat([self.observations(proprioception), eta], dim=-1))
+        return flat.unflatten(-1, (self.shape.bins, self.shape.joints))
+
+    def forward(self, proprioception: Tensor, parameters: Tensor) -> Tensor:
+        """Logits by mu, shape (n, bins, joints)."""
+        return self.logits(proprioception, self.project(parameters))
+
+    def value(self, proprioception: Tensor, true_parameters: Tensor) -> Tensor:
+        """Values in units of the returns' standard deviation from their mean, shape (n,)."""
+        known = 2 * true_parameters[..., : self.shape.privileged] - 1
+        return self.critic(torch.cat([self.observations(proprioception), known], dim=-1))[..., 0]
+
+    @torch.no_grad()
+    def learn_returns(self, returns: Tensor) -> None:
+        """Take returns, shape (n,), into account without a change of what values mean.
+
+        The last layer is moved against the normaliser (PopArt, van Hasselt et al. 2016).
+        """
+        mean, scale = self.returns.mean.clone(), self.returns.scale
+        self.returns.update(returns[:, None])
+        last = self.critic[-1]
+        last.weight.mul_(scale / self.returns.scale)
+        last.bias.mul_(scale).add_(mean - self.returns.mean).div_(self.returns.scale)
+
+
+def greedy(logits: Tensor) -> Tensor:
+    """The likeliest bin of each joint, shape (n, joints)."""
+    return logits.argmax(dim=-2)
+
+
+def draw(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw bins.
+
+    Args:
+      logits: shape (n, bins, joints).
+      uniform: a number in [0, 1) per joint, shape (n, joints).
+
+    Returns:
+      Bins, shape (n, joints), and the logarithm of their probability together, shape (n,).
+    """
+    log = torch.log_softmax(logits, dim=-2)
+    below = log.exp().cumsum(dim=-2) <= uniform[..., None, :]
+    bins = below.sum(dim=-2).clamp(max=logits.shape[-2] - 1)
+    return bins, log_probability(log, bins)
+
+
+def log_probability(log: Tensor, bins: Tensor) -> Tensor:
+    """Logarithm of the probability of bins at all joints together, shape (n,).
+
+    Args:
+      log: logarithms of each bin's probability, shape (n, bins, joints).
+      bins: shape (n, joints).
+    """
+    return log.gather(-2, bins[..., None, :]).sum(dim=(-2, -1))
+
+
+def _layers(inputs: int, hidden: Sequence[int], outputs: int, last: float) -> torch.nn.Sequential:
+    """Linear layers with tanh between them; rows of unit norm, the last layer's of norm `last`."""
+    sizes = (inputs, *hidden, outputs)
+    layers: list[torch.nn.Module] = []
+    for i, (before, after) in enumerate(pairwise(sizes)):
+        layer = torch.nn.Linear(before, after)
+        norm = last if i == len(hidden) else 1.0
+        with torch.no_grad():
+            layer.weight.normal_()
+            layer.weight.mul_(norm / layer.weight.norm(dim=1, keepdim=True))
+            layer.bias.zero_()
+        layers += [layer, torch.nn.Tanh()]
+    return torch.nn.Sequential(*layers[:-1])
