@@ -1,0 +1,50 @@
+"""The policy as a module of RLlib."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.apis import ValueFunctionAPI
+from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
+
+from pup.policy.network import ProjectedPolicy
+from pup.policy.shape import PolicyShape
+
+
+class PolicyModule(TorchRLModule, ValueFunctionAPI):
+    """Wraps a ProjectedPolicy; its shape and seed stand in the model's configuration."""
+
+    def setup(self) -> None:
+        """See RLModule."""
+        shape = PolicyShape.read(self.model_config["shape"])
+        with torch.random.fork_rng():
+            torch.manual_seed(self.model_config["seed"])
+            self.policy = ProjectedPolicy(shape)
+        start = self.model_config.get("start")
+        if start:
+            load(self.policy, start)
+
+    def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
+        """Logits of samples that hold an observation and mu."""
+        return {Columns.ACTION_DIST_INPUTS: self.policy(batch[Columns.OBS], batch["parameters"])}
+
+    def _forward_train(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
+        """Nothing: the losses call the policy themselves, once for states and mirrored states."""
+        return {}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
+        """Values in units of the returns, shape (n,)."""
+        policy = self.policy
+        told = policy.value(batch[Columns.OBS], batch["true_parameters"])
+        return told * policy.returns.scale + policy.returns.mean
+
+
+def load(policy: ProjectedPolicy, weights: dict[str, np.ndarray]) -> None:
+    """Give a policy weights and buffers by name; all of them and no others."""
+    policy.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in weights.items()})
+
+
+def weights_of(policy: ProjectedPolicy) -> dict[str, np.ndarray]:
+    """A policy's weights and buffers by name."""
+    return {k: v.detach().cpu().numpy().copy() for k, v in policy.state_dict().items()}

@@ -1,0 +1,256 @@
+"""PPO on RLlib from batched tasks: the algorithm, its configuration, and its exact state."""
+
+import logging
+import tempfile
+import time
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import ray
+import torch
+from numpy.typing import NDArray
+from ray.rllib.algorithms.ppo import PPO, PPOConfig
+from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_RL_MODULE, DEFAULT_MODULE_ID
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+
+from pup.policy.shape import PolicyShape
+from workers.learner import FragmentsToBatch, Learning, MirrorLearner
+from workers.module import PolicyModule
+from workers.rollouts import BatchRunner, Fragment, Sampling, spaces
+
+State = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that a training is made from.
+
+    Attributes:
+      shape: of the policy.
+      sampling: the task and how it is stepped.
+      learning: how the networks are moved.
+      runners: processes that sample; 0 samples in the learner's own.
+      cores: of each such process.
+      seed: of the first weights.
+      start: weights to begin with, by name; None draws them.
+    """
+
+    shape: PolicyShape
+    sampling: Sampling
+    learning: Learning
+    runners: int = 0
+    cores: int = 1
+    seed: int = 0
+    start: State | None = None
+
+    @property
+    def samples(self) -> int:
+        """Steps of an iteration."""
+        return max(1, self.runners) * self.sampling.simulations * self.sampling.steps
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What an iteration came to.
+
+    Attributes:
+      steps: sampled.
+      lost: not sampled because runners were lost.
+      ended: see Fragment, of all runners.
+      reward: mean of a live step.
+      seconds: of sampling and of learning.
+      learnt: means of the losses, the rate.
+    """
+
+    steps: int
+    lost: int
+    ended: NDArray[np.float64]
+    reward: float
+    seconds: tuple[float, float]
+    learnt: dict[str, float]
+
+
+class BatchPPO(PPO):
+    """PPO whose iteration goes on with the runners that answer, and counts what was lost."""
+
+    told: Iteration
+
+    def _setup_logdir(self) -> None:
+        """Without a folder of RLlib's own in the user's home; results are told elsewhere."""
+        self._folder = tempfile.TemporaryDirectory(prefix="pup-rllib-")
+        self._logdir = self._folder.name
+
+    def cleanup(self) -> None:
+        """See Algorithm."""
+        super().cleanup()
+        self._folder.cleanup()
+
+    def training_step(self) -> None:
+        """See Algorithm."""
+        begin = time.perf_counter()
+        fragments = self._sampled()
+        if not fragments:
+            self.told = Iteration(0, self._expected(), np.empty((0, 4)), np.nan, (0.0, 0.0), {})
+            return
+        sampled = time.perf_counter()
+        results = self.learner_group.update(episodes=fragments, timesteps={}, **self._batches())
+        self.metrics.aggregate(results, key="learners")
+        self._broadcast()
+        steps = sum(map(len, fragments))
+        live = sum(int(f.live.sum()) for f in fragments)
+        self.told = Iteration(
+            steps=steps,
+            lost=self._expected() - steps,
+            ended=np.concatenate([f.ended for f in fragments]),
+            reward=float(sum(f.reward.sum(dtype=np.float64) for f in fragments) / live),
+            seconds=(sampled - begin, time.perf_counter() - sampled),
+            learnt=_numbers(results[0][DEFAULT_MODULE_ID]),
+        )
+
+    def _expected(self) -> int:
+        return int(self.config.train_batch_size)
+
+    def _batches(self) -> dict[str, Any]:
+        c = self.config
+        return {"num_epochs": c.num_epochs, "minibatch_size": c.minibatch_size}
+
+    def _sampled(self) -> list[Fragment]:
+        """A fragment of each runner that answers, in their order."""
+        group = self.env_runner_group
+        if not group.num_remote_env_runners():
+            return group.local_env_runner.sample()
+        told = group.foreach_env_runner(lambda runner: runner.sample(), local_env_runner=False)
+        return [fragment for one in told for fragment in one]
+
+    def _broadcast(self) -> None:
+        """Give the runners the learner's weights; a runner in this process needs no Ray for it."""
+        group = self.env_runner_group
+        if group.num_remote_env_runners():
+            group.sync_weights(from_worker_or_learner_group=self.learner_group, inference_only=True)
+            return
+        state = self.learner_group.get_state(
+            components=f"{COMPONENT_LEARNER}/{COMPONENT_RL_MODULE}", inference_only=True
+        )
+        group.local_env_runner.set_state(state[COMPONENT_LEARNER])
+
+
+def _numbers(told: dict[str, Any]) -> dict[str, float]:
+    """Values of RLlib's statistics that are single numbers."""
+    numbers = {}
+    for name, value in told.items():
+        with suppress(TypeError, ValueError):
+            numbers[name] = float(value.peek() if hasattr(value, "peek") else value)
+    return numbers
+
+
+def start(setup: Setup) -> BatchPPO:
+    """Build the algorithm on the Ray this process is connected to."""
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", category=DeprecationWarning)
+    seen, done = spaces(setup.shape.proprioception, setup.shape.joints, setup.shape.bins)
+    here = torch.cuda.is_available()
+    anywhere = ray.cluster_resources().get("GPU", 0) > 0
+    config = (
+        PPOConfig(algo_class=BatchPPO)
+        .environment(
+            gymnasium.Env,  # asked for, and never made
+            observation_space=seen,
+            action_space=done,
+            env_config={"sampling": setup.sampling},
+            disable_env_checking=True,
+        )
+        .env_runners(
+            env_runner_cls=BatchRunner,
+            num_env_runners=setup.runners,
+            num_cpus_per_env_runner=setup.cores,
+            rollout_fragment_length=setup.sampling.steps,
+            sample_timeout_s=None,
+            merge_env_runner_states=False,
+            broadcast_env_runner_states=False,
+        )
+        .learners(
+            num_learners=1 if anywhere and not here else 0,
+            num_gpus_per_learner=1 if here or anywhere else 0,
+            learner_connector=lambda *_: FragmentsToBatch(setup.learning),
+            add_default_connectors_to_learner_pipeline=False,
+        )
+        .training(
+            learner_class=MirrorLearner,
+            learner_config_dict={"learning": setup.learning},
+            train_batch_size=setup.samples,
+            minibatch_size=setup.learning.minibatch,
+            num_epochs=1,  # FragmentsToBatch lays them out
+            lr=setup.learning.rate,
+            grad_clip=setup.learning.gradient,
+            grad_clip_by="global_norm",
+            use_kl_loss=False,
+            vf_clip_param=float("inf"),
+        )
+        .rl_module(
+            rl_module_spec=RLModuleSpec(
+                module_class=PolicyModule,
+                model_config={
+                    "shape": setup.shape.document(),
+                    "seed": setup.seed,
+                    "start": setup.start,
+                },
+            )
+        )
+        .fault_tolerance(
+            restart_failed_env_runners=True,
+            ignore_env_runner_failures=False,
+            delay_between_env_runner_restarts_s=1.0,
+            max_num_env_runner_restarts=1000,
+        )
+        .debugging(log_level="ERROR")
+    )
+    return config.build_algo()
+
+
+def state_of(algorithm: BatchPPO) -> State:
+    """All that a training which goes on alike needs, as arrays by name."""
+    (learner,) = _each(algorithm.learner_group.foreach_learner(lambda one: one.training_state()))
+    told = {f"learner/{k}": v for k, v in learner.items()}
+    for i, runner in enumerate(_runners(algorithm, lambda one: one.sampler.state())):
+        told |= {f"runner{i}/{k}": v for k, v in runner.items()}
+    return told
+
+
+def restore(algorithm: BatchPPO, state: State) -> None:
+    """Go on where another training told its state; it had as many runners."""
+    learner = _below(state, "learner")
+    algorithm.learner_group.foreach_learner(lambda one: one.restore_training(learner))
+    runners = {
+        i: _below(state, f"runner{i}") for i in range(max(1, algorithm.config.num_env_runners))
+    }
+
+    def give(runner: BatchRunner) -> None:
+        runner.sampler.restore(runners[max(0, runner.worker_index - 1)])
+
+    _runners(algorithm, give)
+    algorithm._broadcast()
+
+
+def weights_of(algorithm: BatchPPO) -> State:
+    """The policy's weights and buffers by name."""
+    (learner,) = _each(algorithm.learner_group.foreach_learner(lambda one: one.training_state()))
+    return _below(learner, "policy")
+
+
+def _below(state: State, prefix: str) -> State:
+    return {k.removeprefix(f"{prefix}/"): v for k, v in state.items() if k.startswith(f"{prefix}/")}
+
+
+def _each(results: Any) -> Sequence[Any]:
+    return [one.get() for one in results]
+
+
+def _runners(algorithm: BatchPPO, action: Any) -> list[Any]:
+    """What the runners that sample answer, in their order."""
+    local = not algorithm.config.num_env_runners
+    return algorithm.env_runner_group.foreach_env_runner(action, local_env_runner=local)
