@@ -11,6 +11,7 @@ from services.options import (
     count,
     knob,
     number,
+    numbers,
     out,
     place,
     recordings,
@@ -19,6 +20,17 @@ from services.options import (
 )
 
 DEFAULT_ROBOT = "darwin_op2"
+TRAINING = (
+    ("--steps", (1000, 10**11), int, 15_000_000, "control steps of all simulations together"),
+    ("--simulations", (1, 65536), int, 256, "at once, of each process that simulates"),
+    ("--length", (2, 4096), int, 80, "control steps of each simulation between two updates"),
+    ("--epochs", (1, 100), int, 5, "passes over the samples of an update"),
+    ("--minibatch", (16, 2**20), int, 2048, "samples of a gradient step"),
+    ("--learning-rate", (1e-7, 1.0), float, 1e-3, "at the beginning"),
+    ("--entropy", (0.0, 10.0), float, 0.0, "weight of exploration, falling to 0"),
+    ("--mirror", (0.0, 1000.0), float, 1.0, "weight of left-right symmetry; never sideways"),
+)
+"""Numbers of a training: option, limits, kind, default and what it is."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -36,7 +48,8 @@ def parser() -> argparse.ArgumentParser:
         ("import", "turn other people's logs into recordings", _import),
         ("record", "record scripted motions of a virtual robot", _record),
         ("presysid", "fit a robot's parameters to recordings, with bounds", _presysid),
-        ("replay", "simulate recordings and compare", _replay),
+        ("train", "train a policy that walks, within bounds; run again, it resumes", _train),
+        ("replay", "simulate recordings and compare, or let a policy walk", _replay),
         ("diagnose", "say what physics the simulator leaves out, and model it", _diagnose),
         ("blind", "make, diagnose or score a sealed set of concealed cases", _blind),
     ):
@@ -69,18 +82,98 @@ def _presysid(verb: argparse.ArgumentParser) -> None:
     place(verb)
 
 
+def _train(verb: argparse.ArgumentParser) -> None:
+    robot(verb, default=DEFAULT_ROBOT, more="; default: %(default)s")
+    verb.add_argument(
+        "--bounds",
+        type=Path,
+        metavar="FILE",
+        help="bounds.json of pre-sysID; default: the robot's own identified.json",
+    )
+    out(verb, "policy/, best/, training.json, curve.png, tensorboard/ and checkpoint.npz")
+    policy = verb.add_argument_group("what is trained, and how long")
+    policy.add_argument(
+        "--method",
+        choices=("pup", "up", "robust", "nominal"),
+        default="pup",
+        help="the policy sees the parameters through a learnt projection, directly, not at all, or "
+        "there is but one set of them; default: %(default)s",
+    )
+    policy.add_argument(
+        "--direction", choices=("forward", "backward", "sideways"), default="forward"
+    )
+    policy.add_argument(
+        "--start", type=Path, metavar="DIR", help="policy to train further; default: from scratch"
+    )
+    policy.add_argument(
+        "--track",
+        choices=("wandb", "mlflow"),
+        action="append",
+        default=[],
+        help="tell Weights & Biases or MLflow too; TensorBoard's files are written in any case",
+    )
+    for name, limits, kind, default, told in TRAINING:
+        policy.add_argument(
+            name,
+            type=number(*limits, kind),
+            default=default,
+            metavar="N" if kind is int else "X",
+            help=f"{told}; default: %(default)s",
+        )
+    policy.add_argument(
+        "--schedule",
+        choices=("linear", "adaptive", "constant"),
+        default="linear",
+        help="of the learning rate: falling to a tenth, following the policy's divergence, or "
+        "neither; default: %(default)s",
+    )
+    seed(policy)
+    where = verb.add_argument_group("where it runs")
+    where.add_argument("--address", help="of a running Ray cluster; default: an embedded Ray")
+    where.add_argument(
+        "--runners",
+        type=number(0, 4096),
+        default=0,
+        metavar="N",
+        help="processes that simulate, lost ones are replaced; default: none beside the learner's",
+    )
+    cores(where)
+
+
 def _replay(verb: argparse.ArgumentParser) -> None:
-    recordings(verb)
+    verb.add_argument(
+        "recordings",
+        type=Path,
+        nargs="*",
+        metavar="RECORDING",
+        help="Parquet file, or a folder of them",
+    )
     robot(verb, required=True)
     verb.add_argument(
         "--bounds",
         type=Path,
         metavar="FILE",
-        help="bounds.json whose nominal values are replayed; default: the robot's own "
-        "identified.json, without one the values of its robot.toml",
+        help="bounds.json whose nominal values are replayed, or that a policy was trained on; "
+        "default: the robot's own identified.json, without one the values of its robot.toml",
     )
-    out(verb, "replay.json and a plot per recording")
+    out(verb, "replay.json and a plot per recording, or of the walk and a video")
     cores(verb)
+    walk = verb.add_argument_group("a policy instead of recordings")
+    walk.add_argument("--policy", type=Path, metavar="DIR", help="policy of `pup train`")
+    walk.add_argument(
+        "--eta",
+        type=numbers,
+        metavar="A,B,...",
+        help="what the policy is conditioned on; default: the projection of the true parameters",
+    )
+    walk.add_argument(
+        "--episodes",
+        type=number(1, 100_000),
+        default=50,
+        metavar="N",
+        help="with parameters drawn from the bounds, for the numbers; default: %(default)s",
+    )
+    seed(walk)
 
 
 def _diagnose(verb: argparse.ArgumentParser) -> None:

@@ -94,7 +94,25 @@ def _presysid(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
+def _train(options: argparse.Namespace) -> dict[str, Any]:
+    if find_spec("torch") is None or find_spec("gymnasium") is None:
+        raise InputError("training needs PyTorch and RLlib; install pup[learn]")
+    from services.progress import trained
+    from services.tracking import check
+    from services.training import train, training_options
+
+    check(tuple(options.track))
+    robot = RobotDescription.load(options.robot)
+    with _folder(options.out) as out, trained() as told:
+        wanted = training_options(options)
+        return train(robot, options.bounds, wanted, out, lambda: places.training(options), told)
+
+
 def _replay(options: argparse.Namespace) -> dict[str, Any]:
+    if bool(options.recordings) == bool(options.policy):
+        raise InputError("give either recordings or --policy DIR")
+    if options.policy:
+        return _walk(options)
     from pup.recording import load_recordings
     from services.replay import replay
 
@@ -102,6 +120,15 @@ def _replay(options: argparse.Namespace) -> dict[str, Any]:
     recordings = load_recordings(options.recordings, robot)
     with _folder(options.out) as out:
         return replay(robot, recordings, options.bounds, out, places.cores(options))
+
+
+def _walk(options: argparse.Namespace) -> dict[str, Any]:
+    from services.walk import Shown, walk
+
+    robot = RobotDescription.load(options.robot)
+    shown = Shown(options.policy, options.bounds, options.eta, options.episodes, options.seed)
+    with _folder(options.out) as out:
+        return walk(robot, shown, out, places.cores(options))
 
 
 def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
@@ -234,10 +261,16 @@ def _show_bounds(shown: dict[str, Any]) -> None:
     print(f"report: {shown['report']}")
 
 
-def _show_replay(shown: dict[str, Any]) -> None:
-    from services.tables import replay_table
+def _show_training(shown: dict[str, Any]) -> None:
+    from services.tables import training_table
 
-    replay_table(shown)
+    training_table(shown)
+
+
+def _show_replay(shown: dict[str, Any]) -> None:
+    from services.tables import replay_table, walk_table
+
+    (walk_table if "policy" in shown else replay_table)(shown)
 
 
 def _show_blind(shown: dict[str, Any]) -> None:
@@ -262,6 +295,7 @@ VERBS = {
     "import": (_import, _show_recordings),
     "record": (_record, _show_recordings),
     "presysid": (_presysid, _show_bounds),
+    "train": (_train, _show_training),
     "replay": (_replay, _show_replay),
     "diagnose": (_diagnose, _show_diagnosis),
     "blind": (_blind, _show_blind),

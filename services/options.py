@@ -1,6 +1,7 @@
 """Options that several verbs share, and what can be written behind them."""
 
 import argparse
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,17 @@ def number(low: float, high: float, kind: type = int) -> Callable[[str], Any]:
         return value
 
     return parse
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """An argument type: numbers between commas."""
+    try:
+        told = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        told = ()
+    if not told or not all(map(math.isfinite, told)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not A,B,..., numbers between commas")
+    return told
 
 
 def knob(text: str) -> tuple[str, float]:

@@ -31,6 +31,15 @@ def fits(options: argparse.Namespace) -> Iterator[Any]:
 
 
 @contextmanager
+def training(options: argparse.Namespace) -> Iterator[int]:
+    """Where a training runs; gives the cores there are for it."""
+    from workers.cluster import connected, cores_there
+
+    with connected(options.address, options.cores):
+        yield options.cores if options.address and options.cores else cores_there()
+
+
+@contextmanager
 def replays(options: argparse.Namespace) -> Iterator[Any]:
     """Where batches of replays run: a `diagnosis.Where`."""
     from services.diagnosis import Where, alone

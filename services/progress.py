@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.live import Live
@@ -62,6 +62,36 @@ def counted(job: str) -> Iterator[Told]:
             left = (time.monotonic() - begin) * (1 - share) / share
             line += f", {_duration(left)} left"
         line += f"; {note}" if note else ""
+        start, end = ("\r\x1b[K", "") if live else ("", "\n")
+        print(f"{start}{line}", file=sys.stderr, end=end, flush=True)
+
+    try:
+        yield tell
+    finally:
+        if live:
+            print(file=sys.stderr)
+
+
+@contextmanager
+def trained() -> Iterator[Callable[[dict[str, Any], int], None]]:
+    """Tells how a training gets on: a live line on a terminal, plain ones when piped."""
+    live, last, first = sys.stderr.isatty(), -math.inf, None
+
+    def tell(row: dict[str, Any], steps: int) -> None:
+        nonlocal last, first
+        before = time.monotonic()
+        first = first or (before, row["steps"])
+        if before - last < (0.2 if live else PLAIN_SECONDS) and row["steps"] < steps:
+            return
+        last, done = before, row["steps"]
+        line = (
+            f"training: {min(1.0, done / steps):.0%}, {done / 1e6:.2f} of {steps / 1e6:.2f} M steps"
+        )
+        if done > first[1]:
+            rate = (done - first[1]) / (before - first[0])
+            line += f", {rate:,.0f}/s, {_duration(max(0, steps - done) / rate)} left"
+        if row["distance"] is not None:
+            line += f"; {row['distance']:.2f} m in {row['time']:.1f} s"
         start, end = ("\r\x1b[K", "") if live else ("", "\n")
         print(f"{start}{line}", file=sys.stderr, end=end, flush=True)
 

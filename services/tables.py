@@ -47,6 +47,35 @@ def replay_table(document: dict[str, Any]) -> None:
     console.print(f"model: {document['actuator']}, {document['model']}", soft_wrap=True)
 
 
+def training_table(document: dict[str, Any]) -> None:
+    """Print what a `training.json` document came to."""
+    curve = document["curve"]
+    lost = f", {document['lost_steps']:,} lost" if document["lost_steps"] else ""
+    print(
+        f"{document['robot']}: {document['method']}, {document['direction']}: "
+        f"{document['steps']:,} steps{lost} in {document['seconds'] / 60:.1f} min"
+    )
+    if curve["distance"][-1] is not None:
+        print(
+            f"while still exploring: {curve['distance'][-1]:.2f} m in {curve['time'][-1]:.1f} s "
+            "an episode; `pup replay --policy` shows the policy itself"
+        )
+
+
+def walk_table(document: dict[str, Any]) -> None:
+    """Print how far a policy of a `replay.json` document walked."""
+    shown = document["shown"]
+    end = "fell" if shown["fell"] else "stayed up"
+    print(f"{document['robot']}: {document['method']}, {document['direction']}")
+    print(f"fitted parameters: {shown['distance']:.2f} m in {shown['time']:.1f} s, {end}")
+    print(
+        f"{document['episodes']} episodes with parameters from the bounds: median "
+        f"{document['distance_median']:.2f} m in {document['time_median']:.1f} s, "
+        f"{document['upright_share']:.0%} without a fall"
+    )
+    print(f"video: {document['video']}, drawn by {document['drawn_by']}")
+
+
 def diagnosis_table(document: dict[str, Any]) -> None:
     """Print the verdict and the findings of a `diagnosis.json` document."""
     console = Console(highlight=False)

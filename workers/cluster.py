@@ -50,6 +50,11 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
         yield
 
 
+def cores_there() -> int:
+    """Cores of the Ray this process is connected to."""
+    return int(ray.cluster_resources().get("CPU", 1))
+
+
 @contextmanager
 def _joined(address: str) -> Iterator[None]:
     _probe(address)

@@ -4,7 +4,7 @@ import logging
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -100,7 +100,7 @@ class BatchPPO(PPO):
         sampled = time.perf_counter()
         results = self.learner_group.update(episodes=fragments, timesteps={}, **self._batches())
         self.metrics.aggregate(results, key="learners")
-        self._broadcast()
+        self.broadcast()
         steps = sum(map(len, fragments))
         live = sum(int(f.live.sum()) for f in fragments)
         self.told = Iteration(
@@ -127,7 +127,7 @@ class BatchPPO(PPO):
         told = group.foreach_env_runner(lambda runner: runner.sample(), local_env_runner=False)
         return [fragment for one in told for fragment in one]
 
-    def _broadcast(self) -> None:
+    def broadcast(self) -> None:
         """Give the runners the learner's weights; a runner in this process needs no Ray for it."""
         group = self.env_runner_group
         if group.num_remote_env_runners():
@@ -148,7 +148,7 @@ def _numbers(told: dict[str, Any]) -> dict[str, float]:
     return numbers
 
 
-def start(setup: Setup) -> BatchPPO:
+def _start(setup: Setup) -> BatchPPO:
     """Build the algorithm on the Ray this process is connected to."""
     logging.getLogger("ray").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
@@ -212,45 +212,59 @@ def start(setup: Setup) -> BatchPPO:
     return config.build_algo()
 
 
-def state_of(algorithm: BatchPPO) -> State:
-    """All that a training which goes on alike needs, as arrays by name."""
-    (learner,) = _each(algorithm.learner_group.foreach_learner(lambda one: one.training_state()))
-    told = {f"learner/{k}": v for k, v in learner.items()}
-    for i, runner in enumerate(_runners(algorithm, lambda one: one.sampler.state())):
-        told |= {f"runner{i}/{k}": v for k, v in runner.items()}
-    return told
+class Trainer:
+    """A training on the Ray this process is connected to.
 
+    Args:
+      setup: all that it is made from.
+    """
 
-def restore(algorithm: BatchPPO, state: State) -> None:
-    """Go on where another training told its state; it had as many runners."""
-    learner = _below(state, "learner")
-    algorithm.learner_group.foreach_learner(lambda one: one.restore_training(learner))
-    runners = {
-        i: _below(state, f"runner{i}") for i in range(max(1, algorithm.config.num_env_runners))
-    }
+    def __init__(self, setup: Setup) -> None:
+        self.algorithm = _start(setup)
+        self.runners = setup.runners
 
-    def give(runner: BatchRunner) -> None:
-        runner.sampler.restore(runners[max(0, runner.worker_index - 1)])
+    def iterate(self) -> Iteration:
+        """Sample and learn."""
+        self.algorithm.train()
+        return self.algorithm.told
 
-    _runners(algorithm, give)
-    algorithm._broadcast()
+    def weights(self) -> State:
+        """The policy's weights and buffers by name."""
+        return _below(self._learner(), "policy")
 
+    def state(self) -> State:
+        """All that a training which goes on alike needs, as arrays by name."""
+        told = {f"learner/{k}": v for k, v in self._learner().items()}
+        for i, runner in enumerate(self._each_runner(lambda one: one.sampler.state())):
+            told |= {f"runner{i}/{k}": v for k, v in runner.items()}
+        return told
 
-def weights_of(algorithm: BatchPPO) -> State:
-    """The policy's weights and buffers by name."""
-    (learner,) = _each(algorithm.learner_group.foreach_learner(lambda one: one.training_state()))
-    return _below(learner, "policy")
+    def restore(self, state: State) -> None:
+        """Go on where another training with as many runners told its state."""
+        learner = _below(state, "learner")
+        self.algorithm.learner_group.foreach_learner(lambda one: one.restore_training(learner))
+        states = [_below(state, f"runner{i}") for i in range(max(1, self.runners))]
+
+        def give(runner: BatchRunner) -> None:
+            runner.sampler.restore(states[max(0, runner.worker_index - 1)])
+
+        self._each_runner(give)
+        self.algorithm.broadcast()
+
+    def close(self) -> None:
+        """End its processes."""
+        self.algorithm.stop()
+
+    def _learner(self) -> State:
+        told = self.algorithm.learner_group.foreach_learner(lambda one: one.training_state())
+        (learner,) = (one.get() for one in told)
+        return dict(learner)
+
+    def _each_runner(self, action: Callable[[BatchRunner], Any]) -> list[Any]:
+        """What the runners that sample answer, in their order."""
+        group = self.algorithm.env_runner_group
+        return list(group.foreach_env_runner(action, local_env_runner=not self.runners))
 
 
 def _below(state: State, prefix: str) -> State:
     return {k.removeprefix(f"{prefix}/"): v for k, v in state.items() if k.startswith(f"{prefix}/")}
-
-
-def _each(results: Any) -> Sequence[Any]:
-    return [one.get() for one in results]
-
-
-def _runners(algorithm: BatchPPO, action: Any) -> list[Any]:
-    """What the runners that sample answer, in their order."""
-    local = not algorithm.config.num_env_runners
-    return algorithm.env_runner_group.foreach_env_runner(action, local_env_runner=local)

@@ -1,0 +1,42 @@
+"""The plot of a training's curve."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pup.files import write_atomic
+from pup.sysid.figures import BLUE, drawing_style, new_figure
+
+PANELS = (
+    ("distance", "distance at the end of an episode, m"),
+    ("time", "time before the fall, s"),
+    ("reward", "reward of a step"),
+    ("kl", "divergence of an iteration, nats"),
+)
+
+
+def draw_curve(file: Path, document: dict[str, Any]) -> None:
+    """Draw what the exploring policy came to over the steps of its training.
+
+    Args:
+      file: PNG to write.
+      document: of `training.json`.
+    """
+    curve = document["curve"]
+    steps = np.array(curve["steps"]) / 1e6
+    with drawing_style():
+        figure = new_figure(9.0, 5.5)
+        for i, (name, title) in enumerate(PANELS):
+            axes = figure.add_subplot(2, 2, i + 1)
+            axes.plot(steps, np.array(curve[name], dtype=float), color=BLUE, linewidth=1.2)
+            axes.set_title(title, fontsize=9)
+            axes.set_xlabel("million steps")
+        figure.suptitle(
+            f"{document['robot']}, {document['method']}, {document['direction']}: "
+            f"{document['steps'] / 1e6:.1f} M steps in {document['seconds'] / 60:.0f} min"
+        )
+        packed = io.BytesIO()
+        figure.savefig(packed, format="png", dpi=120)
+    write_atomic(file, packed.getvalue())

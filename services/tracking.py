@@ -1,0 +1,88 @@
+"""Where a training's curve is told beside its files: TensorBoard, and others when asked for."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+
+OTHERS = ("wandb", "mlflow")
+PROJECT = "pup"
+
+
+def check(track: tuple[str, ...]) -> None:
+    """Refuse trackers that are not installed.
+
+    Raises:
+      InputError: one is not.
+    """
+    for name in track:
+        if find_spec(name) is None:
+            raise InputError(
+                f"--track {name} needs the package {name}, which is not installed; install it or "
+                "leave it out"
+            )
+
+
+class Trackers:
+    """Tells numbers by name, an iteration at a time.
+
+    Args:
+      track: those to tell beside TensorBoard, of OTHERS.
+      out: folder of the training.
+      done: iterations that were told before; what TensorBoard has of later ones is void.
+      options: of the training, told once.
+    """
+
+    def __init__(
+        self, track: tuple[str, ...], out: Path, done: int, options: dict[str, Any]
+    ) -> None:
+        self.track, self.out, self.done, self.options = track, out, done, options
+
+    def __enter__(self) -> "Trackers":
+        from tensorboardX import SummaryWriter
+
+        folder = str(self.out / "tensorboard")
+        self.board = SummaryWriter(folder, purge_step=self.done + 1, max_queue=1000)
+        if "wandb" in self.track:
+            import wandb
+
+            self.run = wandb.init(
+                project=PROJECT, dir=str(self.out), config=self.options, resume="allow"
+            )
+        if "mlflow" in self.track:
+            import mlflow
+
+            mlflow.set_experiment(PROJECT)
+            mlflow.start_run()
+            mlflow.log_params(_flat(self.options))
+        return self
+
+    def tell(self, row: dict[str, Any], iteration: int) -> None:
+        """Tell the numbers of an iteration."""
+        numbers = {name: float(v) for name, v in row.items() if v is not None}
+        for name, value in numbers.items():
+            self.board.add_scalar(name, value, iteration)
+        if "wandb" in self.track:
+            self.run.log(numbers, step=iteration)
+        if "mlflow" in self.track:
+            import mlflow
+
+            mlflow.log_metrics(numbers, step=iteration)
+
+    def __exit__(self, *_: object) -> None:
+        self.board.close()
+        if "wandb" in self.track:
+            self.run.finish()
+        if "mlflow" in self.track:
+            import mlflow
+
+            mlflow.end_run()
+
+
+def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in options.items():
+        nested = isinstance(value, dict)
+        flat |= _flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return flat

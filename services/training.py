@@ -1,0 +1,358 @@
+"""The training job: bounds in, a policy that walks out (paper, sections IV and VI)."""
+
+import argparse
+import hashlib
+import math
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.files import write_json
+from pup.locomotion.sampling import MARGIN
+from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.task import WalkingTask
+from pup.policy.bundle import NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
+from pup.policy.losses import LossWeights
+from pup.policy.mirror import MirrorMap
+from pup.policy.shape import Method, PolicyShape
+from pup.robot import RobotDescription
+from pup.sysid.result import read_bounds
+from services.checkpoint import Checkpoint
+from services.curve import draw_curve
+from services.provenance import engine, now
+from services.tracking import Trackers
+from workers.learner import Learning
+from workers.ppo import Iteration, Setup, Trainer
+from workers.rollouts import Sampling
+from workers.walking import Walking
+
+CHECKPOINT_SECONDS = 30.0
+SMOOTHED = 10
+"""Iterations whose mean return says which weights were best so far."""
+ETAS = 20_000
+"""Draws of mu whose projections span eta's box."""
+
+Told = Callable[[dict[str, Any], int], None]
+"""Told each iteration's row of the curve, and the steps of the whole training."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is trained, and how long.
+
+    Attributes:
+      method: how the policy deals with unknown parameters.
+      direction: of the walk.
+      steps: control steps of all simulations together.
+      seed: of everything random.
+      simulations: at once, of each process that samples.
+      length: control steps of each between two updates.
+      learning: how the networks are moved; what follows from the rest is filled in.
+      runners: processes that sample; 0 for none beside this one.
+      start: bundle whose weights are trained further; None draws weights.
+      track: other places that are told the curve, `wandb` and `mlflow`.
+    """
+
+    method: Method = Method.PUP
+    direction: Direction = Direction.FORWARD
+    steps: int = 15_000_000
+    seed: int = 0
+    simulations: int = 256
+    length: int = 80
+    learning: Learning = field(default_factory=Learning)
+    runners: int = 0
+    start: Path | None = None
+    track: tuple[str, ...] = ()
+
+
+def train(
+    robot: RobotDescription,
+    bounds: Path | None,
+    options: Options,
+    out: Path,
+    cluster: Callable[[], AbstractContextManager[int]],
+    told: Told,
+) -> dict[str, Any]:
+    """Train a policy and write its files; a training that was interrupted goes on.
+
+    Args:
+      robot: the robot.
+      bounds: what pre-sysID wrote; None for the robot's `identified.json`.
+      options: what is trained.
+      out: folder for `policy/`, `best/`, `training.json`, `curve.png`, `tensorboard/` and
+        `checkpoint.npz`.
+      cluster: connects to Ray and gives the cores there are.
+      told: how far it is.
+
+    Returns:
+      The document of `training.json`.
+
+    Raises:
+      InputError: robot, bounds or first policy do not fit, or the folder holds another training.
+    """
+    return _Job(robot, bounds, options, out, told).run(cluster)
+
+
+def training_options(given: argparse.Namespace) -> Options:
+    """What `pup train` was told."""
+    weights = LossWeights(entropy=given.entropy, mirror=given.mirror)
+    learning = Learning(
+        epochs=given.epochs,
+        minibatch=given.minibatch,
+        rate=given.learning_rate,
+        schedule=given.schedule,
+        weights=weights,
+    )
+    return Options(
+        method=Method(given.method),
+        direction=Direction(given.direction),
+        steps=given.steps,
+        seed=given.seed,
+        simulations=given.simulations,
+        length=given.length,
+        learning=learning,
+        runners=given.runners,
+        start=given.start,
+        track=tuple(given.track),
+    )
+
+
+class _Job:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        bounds: Path | None,
+        options: Options,
+        out: Path,
+        told: Told,
+    ) -> None:
+        self.robot, self.options, self.out, self.told = robot, options, out, told
+        self.source = bounds or robot.identified_path
+        if bounds is None and not self.source.exists():
+            raise InputError(
+                f"robot {robot.name!r} comes without identified bounds; give some with --bounds"
+            )
+        self.bounds = read_bounds(self.source, robot)
+        self.bounds_sha256 = hashlib.sha256(self.source.read_bytes()).hexdigest()
+        self.settings = TaskSettings(direction=options.direction)
+        nominal = options.method == Method.NOMINAL
+        self.walking = Walking(robot, self.bounds, self.settings, nominal)
+        task = self.walking(1, 0, 1)
+        self.shape = PolicyShape.of(
+            options.method,
+            len(task.observation_names),
+            len(task.parameter_names),
+            len(task.joints),
+            task.bins,
+        )
+        self.card = self._card(task)
+        self.first = self._first()
+        self.iterations = math.ceil(options.steps / self._per_iteration())
+        self.learning = replace(
+            options.learning,
+            iterations=self.iterations,
+            seed=options.seed,
+            mirror=self._mirror(task),
+        )
+        self.kept = Checkpoint(out / "checkpoint.npz", self._digest())
+        self.rows, self.lost, self.seconds = self.kept.rows, self.kept.lost, self.kept.seconds
+
+    def run(self, cluster: Callable[[], AbstractContextManager[int]]) -> dict[str, Any]:
+        trackers = Trackers(self.options.track, self.out, len(self.rows), self._told_options())
+        if len(self.rows) < self.iterations:
+            with cluster() as cores, trackers:
+                self._go_on(cores, trackers)
+        document = self._document(done=True)
+        draw_curve(self.out / "curve.png", document)
+        write_json(self.out / "training.json", document)
+        return document
+
+    def _go_on(self, cores: int, trackers: Trackers) -> None:
+        with closing(Trainer(self._setup(cores))) as trainer:
+            if self.kept.state:
+                trainer.restore(self.kept.state)
+            written, best = time.monotonic(), self._best()
+            found: Weights | None = None
+            while len(self.rows) < self.iterations:
+                row = self._iterate(trainer)
+                trackers.tell(row, len(self.rows))
+                if self._smoothed(len(self.rows)) > best:
+                    best, found = self._smoothed(len(self.rows)), trainer.weights()
+                if time.monotonic() - written > CHECKPOINT_SECONDS:
+                    self._write(trainer, found)
+                    written, found = time.monotonic(), None
+            self._bundle("policy", trainer.weights())
+            self._write(trainer, found)
+
+    def _iterate(self, trainer: Trainer) -> dict[str, Any]:
+        begin = time.monotonic()
+        told = trainer.iterate()
+        while not told.steps:  # all runners are lost; they start again
+            self.lost += told.lost
+            told = trainer.iterate()
+        self.lost += told.lost
+        self.seconds += time.monotonic() - begin
+        row = _row(told, self.rows[-1]["steps"] if self.rows else 0, self.seconds)
+        self.rows.append(row)
+        self.told(row, self.options.steps)
+        return row
+
+    def _write(self, trainer: Trainer, best: Weights | None) -> None:
+        """A checkpoint; after the best policy so far, which it does not hold."""
+        if best is not None:
+            self._bundle("best", best)
+        self.kept.write(trainer.state(), self.rows, self.lost, self.seconds)
+        write_json(self.out / "training.json", self._document(done=False))
+
+    def _smoothed(self, count: int) -> float:
+        told = [row["return"] for row in self.rows[max(0, count - SMOOTHED) : count]]
+        known = [value for value in told if value is not None]
+        return float(np.mean(known)) if len(told) == SMOOTHED and known else -math.inf
+
+    def _best(self) -> float:
+        return max((self._smoothed(i + 1) for i in range(len(self.rows))), default=-math.inf)
+
+    def _bundle(self, name: str, weights: Weights) -> None:
+        steps = self.rows[-1]["steps"]
+        provenance = {
+            "options": self._told_options(),
+            "steps": steps,
+            "seconds": round(self.seconds, 1),
+            "engine": engine(),
+            "written": now(),
+        }
+        mu = np.random.default_rng(0).uniform(-MARGIN, 1 + MARGIN, (ETAS, len(self.bounds.names)))
+        eta = NumpyPolicy(self.card, weights).project(mu)
+        card = replace(
+            self.card,
+            eta_lower=tuple(eta.min(axis=0).tolist()),
+            eta_upper=tuple(eta.max(axis=0).tolist()),
+            provenance=provenance,
+        )
+        write_bundle(self.out / name, card, weights)
+
+    def _setup(self, cores: int) -> Setup:
+        o = self.options
+        if o.runners > cores:
+            raise InputError(
+                f"{o.runners} runners on {cores} cores; use at most one runner for each core"
+            )
+        share = cores // max(1, o.runners)
+        sampling = Sampling(self.walking, o.simulations, o.length, o.seed, share)
+        return Setup(self.shape, sampling, self.learning, o.runners, share, o.seed, self.first)
+
+    def _per_iteration(self) -> int:
+        o = self.options
+        return max(1, o.runners) * o.simulations * o.length
+
+    def _mirror(self, task: WalkingTask) -> MirrorMap | None:
+        wanted = self.options.learning.weights.mirror and self.options.direction.symmetric
+        if not wanted:
+            return None
+        names = task.observation_names, task.parameter_names
+        return MirrorMap.of(self.robot, *names, bins=task.bins)
+
+    def _first(self) -> dict[str, NDArray[Any]] | None:
+        folder = self.options.start
+        if folder is None:
+            return None
+        card, weights = read_bundle(folder, self.robot)
+        if card.shape != self.shape or card.parameters != self.card.parameters:
+            raise InputError(
+                f"{folder}: a {card.method} policy of other sizes or parameters; start from a "
+                f"{self.options.method} policy trained on bounds of the same parameters"
+            )
+        return dict(weights)
+
+    def _card(self, task: WalkingTask) -> PolicyCard:
+        robot, settings = self.robot, self.settings
+        assert robot.gait is not None
+        nothing = (0.0,) * self.shape.eta
+        return PolicyCard(
+            robot=robot.name,
+            joints=robot.joint_names,
+            lower=tuple(joint.lower for joint in robot.joints),
+            upper=tuple(joint.upper for joint in robot.joints),
+            method=self.options.method,
+            direction=settings.direction.value,
+            shape=self.shape,
+            observation=task.observation_names,
+            parameters=task.parameter_names,
+            parameter_lower=tuple(self.bounds.lower.tolist()),
+            parameter_upper=tuple(self.bounds.upper.tolist()),
+            eta_lower=nothing,
+            eta_upper=nothing,
+            rates=settings.control_rate,
+            reach=settings.direction.reach,
+            smoothing=settings.smoothing,
+            gait=robot.gait,
+            bounds_sha256=self.bounds_sha256,
+            robot_digest=robot.digest,
+            provenance={},
+        )
+
+    def _told_options(self) -> dict[str, Any]:
+        told = asdict(replace(self.options, learning=replace(self.options.learning, mirror=None)))
+        del told["learning"]["mirror"]
+        return told | {"start": None if self.options.start is None else str(self.options.start)}
+
+    def _digest(self) -> str:
+        """Of all that the weights depend on."""
+        told = self._told_options()
+        del told["track"], told["start"]
+        first = hashlib.sha256()
+        for name, value in (self.first or {}).items():
+            first.update(name.encode() + value.tobytes())
+        parts = (
+            self.robot.digest,
+            self.bounds_sha256,
+            repr(self.settings),
+            repr(told),
+            first.hexdigest(),
+        )
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    def _document(self, done: bool) -> dict[str, Any]:
+        columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
+        return {
+            "schema": 1,
+            "robot": self.robot.name,
+            "method": self.options.method,
+            "direction": self.options.direction,
+            "done": done,
+            "steps": self.rows[-1]["steps"],
+            "lost_steps": self.lost,
+            "seconds": round(self.seconds, 1),
+            "curve": columns,
+            "provenance": {
+                "options": self._told_options(),
+                "bounds": str(self.source),
+                "bounds_sha256": self.bounds_sha256,
+                "robot_digest": self.robot.digest,
+                "engine": engine(),
+            },
+        }
+
+
+def _row(told: Iteration, before: int, seconds: float) -> dict[str, Any]:
+    """A point of the curve; nothing where no episode ended."""
+    means = told.ended.mean(axis=0) if len(told.ended) else np.full(4, np.nan)
+    names = ("return", "distance", "time", "fell")
+    row = {
+        "steps": before + told.steps,
+        "seconds": seconds,
+        "episodes": len(told.ended),
+        **dict(zip(names, map(float, means), strict=True)),
+        "reward": told.reward,
+        "sampling_seconds": told.seconds[0],
+        "learning_seconds": told.seconds[1],
+        **told.learnt,
+    }
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

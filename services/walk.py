@@ -1,0 +1,121 @@
+"""The job behind `pup replay --policy`: a trained policy walks in simulation."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.files import write_json
+from pup.locomotion.evaluation import evaluate
+from pup.locomotion.sampling import ParameterSampler
+from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.task import WalkingTask
+from pup.policy.bundle import NumpyPolicy
+from pup.robot import RobotDescription
+from pup.sysid.result import FittedBounds, read_bounds
+from services.footage import Footage, draw_gait, film
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is let walk.
+
+    Attributes:
+      policy: folder of a bundle.
+      bounds: file it was trained on; None for the robot's `identified.json`.
+      eta: what the policy is conditioned on; None projects the true parameters.
+      episodes: with parameters drawn anew, for the numbers.
+      seed: of everything random.
+    """
+
+    policy: Path
+    bounds: Path | None = None
+    eta: tuple[float, ...] | None = None
+    episodes: int = 50
+    seed: int = 0
+
+
+def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict[str, Any]:
+    """Let a policy walk; write `replay.json`, `gait.png` and a video.
+
+    One episode with the fitted parameters is shown. Others, with parameters drawn from the bounds,
+    tell how far the policy gets.
+
+    Args:
+      robot: the robot.
+      shown: what is let walk.
+      out: folder for the files.
+      threads: cores to use.
+
+    Returns:
+      The document of `replay.json`.
+
+    Raises:
+      InputError: the policy, the bounds or eta do not fit.
+    """
+    policy = NumpyPolicy.load(shown.policy, robot)
+    bounds = read_bounds(shown.bounds or robot.identified_path, robot)
+    _same_bounds(policy, bounds, shown)
+    eta = None if shown.eta is None else _eta(policy, shown.eta)
+    settings = TaskSettings(direction=Direction(policy.card.direction)).evaluation()
+
+    def act(seen: NDArray[np.float32], mu: NDArray[np.float32]) -> NDArray[np.int64]:
+        return policy.act(seen, policy.project(mu) if eta is None else eta)
+
+    def task(sampler: ParameterSampler, n: int) -> WalkingTask:
+        rng = np.random.default_rng((shown.seed, n))
+        return WalkingTask(robot, sampler, settings, n, rng, threads)
+
+    footage = Footage.of(task(ParameterSampler.nominal(bounds), 1), act)
+    walks = evaluate(act, task(ParameterSampler(bounds), shown.episodes))
+    draw_gait(out / "gait.png", robot, footage)
+    video, drawn = film(out / "walk", robot, footage)
+    document = {
+        "schema": 1,
+        "robot": robot.name,
+        "policy": str(shown.policy),
+        "method": policy.card.method,
+        "direction": policy.card.direction,
+        "eta": None if eta is None else eta.tolist(),
+        "shown": {
+            "distance": footage.distance,
+            "time": float(footage.time[-1]),
+            "fell": footage.fell,
+        },
+        "episodes": shown.episodes,
+        **walks.summary(),
+        "distance": walks.distance.tolist(),
+        "fell": walks.fell.tolist(),
+        "video": str(video),
+        "drawn_by": drawn,
+    }
+    write_json(out / "replay.json", document)
+    return document
+
+
+def _eta(policy: NumpyPolicy, told: tuple[float, ...]) -> Array:
+    if len(told) != policy.card.shape.eta:
+        raise InputError(
+            f"--eta: {len(told)} numbers, but the policy is conditioned on {policy.card.shape.eta}"
+        )
+    return np.array(told)
+
+
+def _same_bounds(policy: NumpyPolicy, bounds: FittedBounds, shown: Shown) -> None:
+    card = policy.card
+    trained = replace(
+        bounds,
+        names=card.parameters,
+        lower=np.array(card.parameter_lower),
+        upper=np.array(card.parameter_upper),
+    )
+    same = bounds.names == trained.names and np.allclose(
+        [bounds.lower, bounds.upper], [trained.lower, trained.upper], rtol=1e-9
+    )
+    if not same:
+        raise InputError(f"{shown.policy}: was trained on other bounds; give those with --bounds")
