@@ -211,6 +211,19 @@ def test_the_gait_is_the_fourier_series_of_its_table(tmp_path: Path) -> None:
     assert gait.angles(0.0).shape == (2,)
 
 
+def test_a_gait_says_how_it_starts_and_where_it_ends(tmp_path: Path) -> None:
+    """Left out, the limits are the authors' and the feet alone may touch the floor."""
+    plain = RobotDescription.load(robot_folder(tmp_path / "plain")).gait
+    assert plain is not None and plain.ground_bodies == ("left", "right")
+    assert (plain.start, plain.start_pitch, plain.blend) == (None, None, 0.2)
+    assert (plain.tilt_limit, plain.drift_limit, plain.imu_pitch_offset) == (1.0, 0.3, 0.0)
+    told = 'period = 0.5\nstart = "open"\nstart_pitch = 0.1\nground_bodies = ["left", "trunk"]'
+    text = swap("period = 0.5", told)(ROBOT)
+    gait = RobotDescription.load(robot_folder(tmp_path / "told", text)).gait
+    assert gait is not None and gait.start == (0.5, 0.0) and gait.start_pitch == 0.1
+    assert gait.ground_bodies == ("left", "trunk")
+
+
 def test_a_setup_is_completed_with_the_defaults() -> None:
     assert DARWIN.setup({"payload": 0.2}) == {
         "payload": 0.2, "supply_voltage": 12.0, "p_gain": 32.0,
@@ -295,6 +308,20 @@ WRONG_ROBOT = [
         "network.error_scale: missing; write a finite",
     ),
     ("period = 0.5", "period = 0", "gait.period: 0 s is not above 0"),
+    (
+        "period = 0.5",
+        'period = 0.5\nstart = "up"',
+        "gait.start: there is no pose 'up'; poses: open",
+    ),
+    ("period = 0.5", "period = 0.5\nblend = -1", "gait.blend: -1 s is negative"),
+    ("period = 0.5", "period = 0.5\ntilt_limit = 0", "gait.tilt_limit: 0 is not above 0"),
+    ("period = 0.5", "period = 0.5\ndrift_limit = -1", "gait.drift_limit: -1 is not above 0"),
+    (
+        "period = 0.5",
+        'period = 0.5\nground_bodies = ["toe"]',
+        "gait.ground_bodies: model.xml has no body 'toe'",
+    ),
+    ("period = 0.5", "period = 0.5\nblnd = 1", "gait.blnd: unknown key; known here: blend,"),
     ("[gait.joints.l]", "[gait.joints.x]", "gait.joints.x: there is no such joint"),
     ("b = [0.0, 0.5]", "b = [0.0]", "gait.joints.l.b: 1 numbers, but a has 2"),
 ]
