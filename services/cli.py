@@ -97,6 +97,8 @@ def _presysid(options: argparse.Namespace) -> dict[str, Any]:
 def _train(options: argparse.Namespace) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("gymnasium") is None:
         raise InputError("training needs PyTorch and RLlib; install pup[learn]")
+    # Torch's threads sleep while they wait: spinning takes the cores from the simulations.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from services.progress import trained
     from services.tracking import check
     from services.training import train, training_options

@@ -114,7 +114,9 @@ def _decorated(robot: RobotDescription, spec: Any) -> None:
     for geom in spec.geoms:
         if geom.name == FLOOR:
             geom.material = "squares"
-    spec.worldbody.add_light(pos=[0, -1, 3], dir=[0, 0.3, -1], castshadow=True)
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.5] * 3
+    sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_FLAT
+    spec.add_texture(name="sky", type=sky[0], builtin=sky[1], rgb1=[1, 1, 1], width=8, height=48)
 
 
 def draw_gait(file: Path, robot: RobotDescription, footage: Footage) -> None:

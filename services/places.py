@@ -6,6 +6,8 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from pup.errors import InputError
+
 Each = Callable[[Callable[[Any], Any], Sequence[Any]], Generator[tuple[int, Any], None, None]]
 """Does a job for each of some things, and yields their places in the list and the outcomes as they
 come; the outcome of a job whose process was lost is an exception."""
@@ -35,6 +37,10 @@ def training(options: argparse.Namespace) -> Iterator[int]:
     """Where a training runs; gives the cores there are for it."""
     from workers.cluster import connected, cores_there
 
+    if not options.address and options.runners > cores(options):
+        raise InputError(
+            f"--runners {options.runners} on {cores(options)} cores; use at most one for each core"
+        )
     with connected(options.address, options.cores):
         yield options.cores if options.address and options.cores else cores_there()
 

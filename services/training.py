@@ -2,6 +2,7 @@
 
 import argparse
 import hashlib
+import json
 import math
 import time
 from collections.abc import Callable
@@ -34,6 +35,8 @@ from workers.rollouts import Sampling
 from workers.walking import Walking
 
 CHECKPOINT_SECONDS = 30.0
+LEARNER_THREADS = 4
+"""At most: the networks are small."""
 SMOOTHED = 10
 """Iterations whose mean return says which weights were best so far."""
 ETAS = 20_000
@@ -242,11 +245,12 @@ class _Job:
         o = self.options
         if o.runners > cores:
             raise InputError(
-                f"{o.runners} runners on {cores} cores; use at most one runner for each core"
+                f"--runners {o.runners} on {cores} cores; use at most one for each core"
             )
         share = cores // max(1, o.runners)
         sampling = Sampling(self.walking, o.simulations, o.length, o.seed, share)
-        return Setup(self.shape, sampling, self.learning, o.runners, share, o.seed, self.first)
+        learning = replace(self.learning, threads=min(cores, LEARNER_THREADS))
+        return Setup(self.shape, sampling, learning, o.runners, share, o.seed, self.first)
 
     def _per_iteration(self) -> int:
         o = self.options
@@ -299,9 +303,10 @@ class _Job:
         )
 
     def _told_options(self) -> dict[str, Any]:
+        """The options as JSON values, without what follows from the robot."""
         told = asdict(replace(self.options, learning=replace(self.options.learning, mirror=None)))
         del told["learning"]["mirror"]
-        return told | {"start": None if self.options.start is None else str(self.options.start)}
+        return dict(json.loads(json.dumps(told, default=str)))
 
     def _digest(self) -> str:
         """Of all that the weights depend on."""

@@ -42,7 +42,7 @@ class Learning:
       threads: of torch.
     """
 
-    epochs: int = 5
+    epochs: int = 4
     minibatch: int = 2048
     rate: float = 1e-3
     schedule: Literal["linear", "adaptive", "constant"] = "linear"

@@ -5,7 +5,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +17,7 @@ from ray.rllib.algorithms.ppo import PPO, PPOConfig
 from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_RL_MODULE, DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
+from pup.policy.losses import Losses
 from pup.policy.shape import PolicyShape
 from workers.learner import FragmentsToBatch, Learning, MirrorLearner
 from workers.module import PolicyModule
@@ -140,12 +140,8 @@ class BatchPPO(PPO):
 
 
 def _numbers(told: dict[str, Any]) -> dict[str, float]:
-    """Values of RLlib's statistics that are single numbers."""
-    numbers = {}
-    for name, value in told.items():
-        with suppress(TypeError, ValueError):
-            numbers[name] = float(value.peek() if hasattr(value, "peek") else value)
-    return numbers
+    """What our learner logged, out of RLlib's statistics."""
+    return {name: float(told[name].peek()) for name in (*Losses._fields, "rate")}
 
 
 def _start(setup: Setup) -> BatchPPO:

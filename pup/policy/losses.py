@@ -1,7 +1,7 @@
 """What a policy is trained with: advantages, PPO's losses and the mirror loss."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -97,32 +97,45 @@ class TorchMirror:
 
     def probabilities(self, told: Tensor) -> Tensor:
         """Mirrored probabilities, shape (n, bins, joints)."""
-        return told.flatten(-2)[:, self.logits].view_as(told)
+        return _Exchange.apply(told.flatten(-2), self.logits).view_as(told)
+
+
+class _Exchange(torch.autograd.Function):
+    """Columns in another order, an involution: its gradient is exchanged alike, not scattered."""
+
+    @staticmethod
+    def forward(context: Any, columns: Tensor, order: Tensor) -> Tensor:
+        context.save_for_backward(order)
+        return columns.index_select(-1, order)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (order,) = context.saved_tensors
+        return gradient.index_select(-1, order), None
 
 
 def losses(
     policy: ProjectedPolicy, samples: Samples, weights: LossWeights, mirror: TorchMirror | None
 ) -> Losses:
-    """PPO's losses and the mirror loss of a minibatch."""
+    """PPO's losses of a minibatch, and the mirror loss of half of it."""
     count = len(samples.log)
     seen, parameters = samples.proprioception, samples.parameters
-    if mirror is None or not weights.mirror:
-        log = torch.log_softmax(policy(seen, parameters), dim=-2)
-        told = log.exp()
-        apart = told.new_zeros(())
-    else:  # one pass for both: small layers are mostly overhead
-        seen = torch.cat([seen, mirror.observation(seen)])
-        parameters = torch.cat([parameters, parameters[:, mirror.parameters]])
-        log = torch.log_softmax(policy(seen, parameters), dim=-2)
-        told = log.exp()
-        off = told[count:] - mirror.probabilities(told[:count])
-        apart = off.square().sum() / (count * policy.shape.joints)
-        log, told = log[:count], told[:count]
+    half = count // 2 if mirror is not None and weights.mirror > 0 else 0
+    if half:  # of the samples, which are shuffled: enough for a tendency, at half the price
+        seen = torch.cat([seen, mirror.observation(seen[:half])])
+        parameters = torch.cat([parameters, parameters[:half, mirror.parameters]])
+    whole = torch.log_softmax(policy(seen, parameters), dim=-2)
+    log, other = whole.split([count, half])
+    apart = whole.new_zeros(())
+    if half:
+        off = other.exp() - mirror.probabilities(log[:half].exp())
+        apart = off.square().sum() / (half * policy.shape.joints)
     change = log_probability(log, samples.bins) - samples.log
     ratio = change.exp()
     kept = ratio.clamp(1 - weights.clip, 1 + weights.clip)
     surrogate = -torch.minimum(ratio * samples.advantages, kept * samples.advantages).mean()
-    entropy = -(told * log).sum() / (count * policy.shape.joints)
+    with torch.set_grad_enabled(weights.entropy > 0 and torch.is_grad_enabled()):
+        entropy = -(log.exp() * log).sum() / (count * policy.shape.joints)
     error = policy.value(samples.proprioception, samples.true_parameters) - samples.returns
     value = 0.5 * error.square().mean()
     total = surrogate + weights.value * value + weights.mirror * apart - weights.entropy * entropy

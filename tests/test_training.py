@@ -1,0 +1,274 @@
+"""Training: samplers, batches, the learner on a real Ray, and the job with its files."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import closing, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_task import EPISODE, ToyTask
+
+pytest.importorskip("torch")
+pytest.importorskip("gymnasium")
+
+import torch
+
+from pup.errors import InputError
+from pup.policy.bundle import NumpyPolicy
+from pup.policy.losses import LossWeights
+from pup.policy.network import ProjectedPolicy
+from pup.policy.shape import Method, PolicyShape
+from pup.robot import RobotDescription
+from services import training
+from workers.cluster import connected
+from workers.learner import Learning, merged, prepared, shuffled
+from workers.module import PolicyModule
+from workers.ppo import Setup, Trainer
+from workers.rollouts import Sampler, Sampling, spaces
+
+SHAPE = PolicyShape.of(Method.PUP, 2, 2, 2)
+SAMPLING = Sampling(ToyTask, simulations=32, steps=32, seed=0, threads=1)
+LEARNING = Learning(epochs=4, minibatch=256, iterations=30)
+TOY = Setup(SHAPE, SAMPLING, LEARNING)
+ROBOT = RobotDescription.load("darwin_op2")
+
+
+@pytest.fixture(scope="module")
+def ray_here() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # runners import the toy
+        with connected(cores=2):
+            yield
+
+
+def policy() -> ProjectedPolicy:
+    torch.manual_seed(0)
+    return ProjectedPolicy(SHAPE)
+
+
+def module() -> PolicyModule:
+    seen, done = spaces(2, 2, 11)
+    told = {"shape": SHAPE.document(), "seed": 0, "start": None}
+    return PolicyModule(observation_space=seen, action_space=done, model_config=told)
+
+
+# --- Without Ray ----------------------------------------------------------------------------------
+
+
+def test_a_fragment_is_what_the_task_told() -> None:
+    """Slots, resets and ended episodes are counted right to the sample."""
+    fragment = Sampler(replace(SAMPLING, steps=2 * EPISODE), 0).sample(policy())
+    over = fragment.terminated | fragment.truncated
+    assert len(fragment) == 32 * 2 * EPISODE
+    np.testing.assert_array_equal(fragment.live[1:], ~over[:-1])
+    assert len(fragment.ended) == over.sum()
+    assert fragment.ended[:, 3].sum() == fragment.terminated.sum()
+    assert (fragment.reward[~fragment.live] == 0).all()
+    whole = np.isclose(fragment.ended[:, 2], 0.1 * EPISODE)
+    assert whole.sum() == fragment.truncated.sum()
+    i = int(np.flatnonzero(fragment.truncated.any(axis=0))[0])
+    end = int(np.flatnonzero(fragment.truncated[:, i])[0])
+    begin = end - EPISODE + 1
+    expected = fragment.reward[begin : end + 1, i].sum()
+    assert np.isclose(fragment.ended[:, 0], expected, atol=1e-4).any()
+
+
+def test_a_sampler_goes_on_where_another_stopped() -> None:
+    """Bit by bit, in the middle of episodes."""
+    one, two = Sampler(SAMPLING, 0), Sampler(SAMPLING, 0)
+    one.sample(policy())
+    state = {name: value.copy() for name, value in one.state().items()}
+    expected = one.sample(policy())
+    two.restore(state)
+    again = two.sample(policy())
+    for name in vars(expected):
+        np.testing.assert_array_equal(getattr(again, name), getattr(expected, name))
+
+
+def test_runners_sample_different_things() -> None:
+    """By their index alone."""
+    a, b = (Sampler(SAMPLING, index).sample(policy()) for index in (1, 2))
+    assert not np.array_equal(a.proprioception[0], b.proprioception[0])
+    assert not np.array_equal(a.bins, b.bins)
+
+
+def test_samples_of_fragments() -> None:
+    """Resets are left out; returns are advantages and values together; nothing is mixed up."""
+    fragments = [Sampler(SAMPLING, i).sample(policy()) for i in (1, 2)]
+    sampled = [prepared(module(), f, LEARNING) for f in fragments]
+    whole = merged(sampled)
+    assert len(whole.log) == sum(int(f.live.sum()) for f in fragments)
+    live = fragments[0].live
+    np.testing.assert_array_equal(sampled[0].bins, fragments[0].bins[live])
+    np.testing.assert_array_equal(sampled[0].proprioception, fragments[0].proprioception[:-1][live])
+    values = module().policy.value(sampled[0].proprioception, sampled[0].true_parameters)
+    told = (sampled[0].returns - sampled[0].advantages).numpy()
+    np.testing.assert_allclose(told, values.detach().numpy(), atol=1e-4)
+
+
+def test_epochs_are_shuffled_alike_by_seed() -> None:
+    """Every epoch has whole minibatches of different samples, in another order."""
+    order = shuffled(1000, replace(LEARNING, epochs=3), np.random.default_rng(1))
+    again = shuffled(1000, replace(LEARNING, epochs=3), np.random.default_rng(1))
+    np.testing.assert_array_equal(order, again)
+    epochs = order.reshape(3, 768)
+    assert all(len(set(epoch)) == 768 for epoch in epochs)
+    assert not np.array_equal(epochs[0], np.sort(epochs[0]))
+    assert not np.array_equal(epochs[0], epochs[1])
+
+
+# --- On a real Ray --------------------------------------------------------------------------------
+
+
+def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+
+
+def weights_after(setup: Setup, iterations: int) -> dict[str, np.ndarray]:
+    with closing(Trainer(setup)) as trainer:
+        for _ in range(iterations):
+            trainer.iterate()
+        return trainer.weights()
+
+
+@pytest.mark.ray
+def test_a_toy_is_learnt(ray_here: None) -> None:
+    """Masses come to rest within 30 iterations, and the value function knows it."""
+    with closing(Trainer(TOY)) as trainer:
+        told = [trainer.iterate() for _ in range(30)]
+    assert told[0].reward < 0.3
+    assert told[-1].reward > 0.85
+    assert told[-1].learnt["value"] < 0.1
+    assert told[-1].learnt["rate"] < 0.2 * told[0].learnt["rate"]
+    assert told[-1].ended[:, 3].mean() < 0.05
+    assert all(one.steps == 1024 and one.lost == 0 for one in told)
+
+
+@pytest.mark.ray
+def test_weights_are_those_of_the_seed(ray_here: None) -> None:
+    """Equal seeds give equal weights to the last bit, others do not."""
+    first = weights_after(TOY, 3)
+    assert same(first, weights_after(TOY, 3))
+    other = replace(TOY, seed=1, sampling=replace(SAMPLING, seed=1))
+    assert not same(first, weights_after(other, 3))
+
+
+@pytest.mark.ray
+@pytest.mark.parametrize("runners", [0, 2])
+def test_a_restored_training_ends_alike(ray_here: None, runners: int) -> None:
+    """With the same weights as one that went on."""
+    setup = replace(TOY, runners=runners)
+    with closing(Trainer(setup)) as trainer:
+        for _ in range(2):
+            trainer.iterate()
+        state = trainer.state()
+        for _ in range(2):
+            trainer.iterate()
+        expected = trainer.weights()
+    with closing(Trainer(setup)) as trainer:
+        trainer.restore(state)
+        for _ in range(2):
+            trainer.iterate()
+        assert same(expected, trainer.weights())
+
+
+@pytest.mark.ray
+def test_training_outlives_a_runner(ray_here: None) -> None:
+    """What was lost with it is counted, and another takes its place with the same weights."""
+    with closing(Trainer(replace(TOY, runners=2))) as trainer:
+        assert trainer.iterate().steps == 2048
+        first, _ = trainer._each_runner(lambda runner: os.getpid())
+        os.kill(first, signal.SIGKILL)
+        struck = trainer.iterate()
+        assert (struck.steps, struck.lost) == (1024, 1024)
+        for _ in range(60):
+            if trainer.iterate().lost == 0:
+                break
+            time.sleep(0.5)
+        assert trainer.iterate().lost == 0
+        weights = trainer._each_runner(lambda r: r.module.policy.actor[0].weight.detach().numpy())
+        assert np.array_equal(weights[0], weights[1])
+        assert np.array_equal(weights[0], trainer.weights()["actor.0.weight"])
+
+
+# --- The job --------------------------------------------------------------------------------------
+
+SMALL = training.Options(
+    steps=128,
+    simulations=4,
+    length=8,
+    learning=Learning(epochs=2, minibatch=16, weights=LossWeights(mirror=1.0)),
+)
+
+
+def job(out: Path, options: training.Options = SMALL, told=lambda row, steps: None):
+    return training.train(ROBOT, None, options, out, lambda: nullcontext(2), told)
+
+
+def weights_of(out: Path) -> dict[str, np.ndarray]:
+    with np.load(out / "policy" / "weights.npz", allow_pickle=False) as packed:
+        return {name: packed[name] for name in packed.files}
+
+
+@pytest.mark.ray
+def test_an_interrupted_job_ends_alike(
+    ray_here: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped after two of four iterations, the same command gives the same weights and curve."""
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    whole = job(tmp_path / "whole")
+    assert whole["done"] and whole["steps"] == 128 and whole["lost_steps"] == 0
+
+    def stop(row: dict[str, object], steps: int) -> None:
+        if row["steps"] == 96:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        job(tmp_path / "halves", told=stop)
+    assert not (tmp_path / "halves" / "policy").exists()
+    part = json.loads((tmp_path / "halves" / "training.json").read_text())
+    assert (part["done"], part["steps"]) == (False, 64)
+    halves = job(tmp_path / "halves")
+    assert same(weights_of(tmp_path / "whole"), weights_of(tmp_path / "halves"))
+    for name in ("steps", "return", "reward", "kl", "value", "rate"):
+        assert halves["curve"][name] == whole["curve"][name]
+    rows: list[object] = []
+    assert job(tmp_path / "halves", told=lambda row, steps: rows.append(row))["done"]
+    assert not rows  # there was nothing left to do
+    with pytest.raises(InputError, match="another training"):
+        job(tmp_path / "halves", replace(SMALL, seed=1))
+
+
+@pytest.mark.ray
+def test_a_job_leaves_what_a_robot_and_a_reader_need(ray_here: None, tmp_path: Path) -> None:
+    """Bundle, curve and TensorBoard's file; another training can start from the bundle."""
+    document = job(tmp_path, replace(SMALL, method=Method.UP))
+    assert json.loads((tmp_path / "training.json").read_text()) == document
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert list((tmp_path / "tensorboard").glob("events*"))
+    run = NumpyPolicy.load(tmp_path / "policy", ROBOT)
+    assert run.card.method == "up"
+    assert run.card.direction == "forward"
+    assert run.card.shape.eta == len(run.card.parameters) == 14
+    assert run.act(np.zeros(44), run.project(np.full(14, 0.5))).shape == (20,)
+    further = replace(SMALL, method=Method.UP, start=tmp_path / "policy", steps=32)
+    assert job(tmp_path / "further", further)["done"]
+    with pytest.raises(InputError, match="other sizes"):
+        job(tmp_path / "other", replace(SMALL, start=tmp_path / "policy"))
+
+
+@pytest.mark.ray
+@pytest.mark.parametrize("method", [Method.ROBUST, Method.NOMINAL])
+def test_policies_that_see_no_parameters(ray_here: None, tmp_path: Path, method: Method) -> None:
+    """Sideways too, where there is no symmetry."""
+    options = replace(SMALL, method=method, steps=64, direction=training.Direction.SIDEWAYS)
+    document = job(tmp_path, options)
+    assert document["curve"]["mirror"] == [0.0, 0.0]
+    run = NumpyPolicy.load(tmp_path / "policy", ROBOT)
+    assert run.card.shape.eta == 0
+    assert run.act(np.zeros(44), np.zeros(0)).shape == (20,)
