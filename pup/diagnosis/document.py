@@ -1,13 +1,16 @@
 """`diagnosis.json` (CONTRACTS.md, section 5)."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.verdict import Finding, HeldOut
+from pup.diagnosis.wording import SLIDING
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
+from pup.sysid.accuracy import JointUnits
 
 SCHEMA = 1
 
@@ -22,6 +25,8 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
     robot, noise = diagnosis.robot, diagnosis.noise
     joints = len(robot.joints)
     certificate = diagnosis.nominal.certificate
+    slides = JointUnits.of(robot, diagnosis.measured.recordings).position == "m"
+    units = SLIDING if slides else {}
     return {
         "schema": SCHEMA,
         "robot": robot.name,
@@ -32,7 +37,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
             "rms": float(np.sqrt(np.mean(noise.sigma[:joints] ** 2))),
             "source": noise.source,
         },
-        "findings": [_finding(f, robot) for f in diagnosis.findings],
+        "findings": [_finding(f, robot, units) for f in diagnosis.findings],
         "held_out": _held_out(diagnosis.held_out),
         "next_recording": diagnosis.ask.document() if diagnosis.ask else None,
         "corrected_robot": corrected,
@@ -43,14 +48,18 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
     }
 
 
-def _finding(finding: Finding, robot: RobotDescription) -> dict[str, Any]:
+def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]) -> dict[str, Any]:
     return {
         "effect": finding.effect,
         "place": _place(finding.place, robot),
         "regime": finding.regime,
         "when": [{"recording": w.recording, "start": w.start, "end": w.end} for w in finding.when],
         "parameters": {
-            name: {"value": p.value, "unit": p.unit, "ci90": [p.lower, p.upper]}
+            name: {
+                "value": p.value,
+                "unit": units.get(p.unit, p.unit),
+                "ci90": [p.lower, p.upper],
+            }
             for name, p in finding.parameters.items()
         },
         "probability": round(finding.probability, 6),

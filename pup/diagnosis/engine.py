@@ -1,25 +1,25 @@
 """The whole diagnosis: from recordings to what the simulator leaves out."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.discover import Unexplained, unexplained
-from pup.diagnosis.evidence import Trace, threshold
+from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import differentiate
-from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.nominal import Nominal, fit_nominal
+from pup.diagnosis.pieces import pieces
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise, assumed_noise
+from pup.diagnosis.search import Search, followed, search
 from pup.diagnosis.selection import Model, Round, Selector
 from pup.diagnosis.splits import Split, splits
-from pup.diagnosis.tracing import traces
 from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space
@@ -29,8 +29,6 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-FALSE_ALARMS = 0.002
-"""Chance that pure noise makes any hypothesis stand out."""
 FEWEST = 60
 """Samples below which nothing can be said."""
 MOTION = 0.02
@@ -98,14 +96,14 @@ def diagnose(
 
     Args:
       robot: the robot, with the nominal actuator of CONTRACTS.md, section 2.
-      recordings: of that robot.
+      recordings: of that robot; one alone is taken in parts, where it comes to rest between them.
       runner: makes what runs batches of replays.
       lanes: how many run at once.
       progress: told the stage and the share of all that is done.
       seed: of everything random.
     """
     rng = np.random.default_rng(seed)
-    measured = Measured.of(robot, recordings)
+    measured = Measured.of(robot, pieces(recordings))
     replays = Replays(measured, robot_space(robot, "pd"), runner(measured), lanes)
     progress("nominal fit", 0.0)
     nominal = fit_nominal(replays, assumed_noise(measured), rng)
@@ -134,25 +132,22 @@ def diagnose(
     reason = _too_poor(measured)
     if reason:
         return told("undetermined", reason)
+    first = _first_look(nominal, replays, runner, rng, progress)
+    if first is not None:
+        nominal = replace(nominal, certificate=first[0].certificate)
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
-    progress("score test", 0.3)
-    found = traces(hypotheses(measured), nominal.fit, replays, nominal.noise)
-    if not found:
+    done = search(replays, nominal, rng, progress, first[1] if first else None)
+    if done is None:
         return told("undetermined", "the motions would not show any effect of the library")
-    enough = threshold(found, rng, FALSE_ALARMS)
-    selector = Selector(replays, nominal.noise, found, enough, nominal.fit)
-    progress("refits", 0.5)
-    model, rounds = selector.run()
-    if model.fit.jacobian is None:
-        differentiate([model.fit], replays, nominal.noise)
+    model, rounds, selector = done.model, done.rounds, done.selector
     progress("what is left", 0.8)
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
     evidence: dict[str, Any] = {
-        "found": tuple(found),
-        "enough": enough,
-        "rounds": tuple(rounds),
+        "found": done.found,
+        "enough": done.enough,
+        "rounds": rounds,
         "held_out": held_out(measured, selector.nominal, final, seed),
         "model": final,
         "unexplained": left,
@@ -172,6 +167,26 @@ def diagnose(
     every = (*named, left.finding) if left else named
     evidence["findings"] = tuple(sorted(every, key=lambda finding: -finding.gain))
     return told("mismatch", ask=ask, **evidence)
+
+
+def _first_look(
+    nominal: Nominal,
+    replays: Replays,
+    runner: Callable[[Measured], Runner],
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[Nominal, Search] | None:
+    """What is missing in the motions that the nominal model can follow, where it loses others."""
+    kept = followed(nominal, replays)
+    if not kept:
+        return None
+    recordings = replays.measured.recordings
+    part = Measured.of(replays.measured.robot, [recordings[i] for i in kept])
+    some = Replays(part, replays.space, runner(part), replays.lanes)
+    fitted = fit_nominal(some, assumed_noise(part), rng)
+    found = search(some, fitted, rng, progress) if fitted.certificate.holds else None
+    replays.simulated += some.simulated
+    return None if found is None else (fitted, found)
 
 
 def _next(

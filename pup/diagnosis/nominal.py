@@ -21,7 +21,9 @@ STARTS = 3
 SPREAD = 0.35
 """Of the starts around the nominal values, in logarithms."""
 AGREEMENT = 3e-3
-"""Two starts agree in chi-squared to this share of it, or to ABSOLUTE."""
+"""Two starts agree in chi-squared to this share of it, to ABSOLUTE, or to EXCESS of what is more
+than noise: where much is missing, a fit has many ends that lack it all the same."""
+EXCESS = 0.03
 ABSOLUTE = 5.0
 ROUGH = 2e-3
 """Relative gain of chi-squared at which the starts may end: all that follows is the noise floor."""
@@ -29,6 +31,8 @@ WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
 """Widths of finite differences with which starts that disagree are taken further."""
 SELF = 3.0
 """A refit of the fit's own simulation may be off by so many standard deviations."""
+SELVES = 3
+"""Refits of its own simulation, of which one must find it again."""
 FREE = ("kp", "kd", "tau_max", "armature", "ground_friction")
 
 
@@ -110,8 +114,10 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
 
 
 def _agree(first: Fit, second: Fit) -> bool:
-    apart = abs(first.chi2 - second.chi2)
-    return apart <= max(AGREEMENT * min(first.chi2, second.chi2), ABSOLUTE)
+    assert first.residual is not None
+    least, apart = min(first.chi2, second.chi2), abs(first.chi2 - second.chi2)
+    excess = least - len(first.residual)
+    return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE)
 
 
 def _start(
@@ -134,9 +140,14 @@ def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Ge
     # What the model leaves counts as noise here too: nothing is known better than that.
     misfit = max(1.0, fit.chi2 / len(replays.measured.values))
     deviation = np.sqrt(misfit * np.diag(fit.covariance()))
-    away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
     low, high = ([getattr(c, end) for c in fit.coordinates] for end in ("lower", "upper"))
-    start = np.clip(fit.at + away, low, high)
-    own = Fit(fit.coordinates, start, data=replays([fit.row()])[0], jacobian=fit.jacobian, age=1)
-    fit_together([own], replays, noise, iterations=8)
-    return float(np.max(np.abs(own.at - fit.at) / deviation))
+    simulated, off = replays([fit.row()])[0], np.inf
+    for _ in range(SELVES):  # a kink on the way says nothing of where the way leads
+        away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
+        start = np.clip(fit.at + away, low, high)
+        own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1)
+        fit_together([own], replays, noise, iterations=8)
+        off = min(off, float(np.max(np.abs(own.at - fit.at) / deviation)))
+        if off <= SELF:
+            break
+    return off

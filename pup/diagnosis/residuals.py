@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.simulator import Trajectories, tick_slices
+from pup.physics.terms.scale import Scale
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
@@ -26,10 +27,10 @@ SETTLING = 0.1
 STILL = 0.3
 """A joint whose command has not changed for so long counts as still, s."""
 ASSUMED = {"joint": 2e-3, "tilt": 5e-3}
-"""Noise to begin with, rad."""
+"""Noise to begin with, rad; of a slide as much less as its range is."""
 LEAST = 1e-4
-"""No channel is believed to be less noisy than this, rad."""
-MEMORY = 0.7
+"""No channel is believed to be less noisy than this, rad; slides as above."""
+MEMORY = 0.85
 """Errors at rest with a longer memory from tick to tick are a drift, not noise."""
 NORMAL_CUT = 0.965
 """Mean square of a normal variable whose squares are cut at their 98 % quantile."""
@@ -141,7 +142,8 @@ class Measured:
 def assumed_noise(measured: Measured) -> Noise:
     """Noise to weigh a first fit with."""
     joints = len(measured.robot.joints)
-    sigma = np.r_[np.full(joints, ASSUMED["joint"]), np.full(2, ASSUMED["tilt"])]
+    angle = Scale.of(measured.robot).angle
+    sigma = np.r_[np.full(joints, ASSUMED["joint"] * angle), np.full(2, ASSUMED["tilt"])]
     return Noise(sigma, np.zeros(joints + 2), "assumed")
 
 
@@ -176,7 +178,7 @@ def _pooled(
 ) -> Noise:
     """Channels that say nothing take the median of their kind; one kind shares its correlation."""
     joints = len(measured.robot.joints)
-    noise = assumed_noise(measured)
+    noise, least = assumed_noise(measured), LEAST * Scale.of(measured.robot).angle
     sigma, rho = noise.sigma.copy(), noise.rho.copy()
     for kind in (range(joints), range(joints, joints + 2)):
         known = [told[c] for c in kind if c in told]
@@ -187,7 +189,7 @@ def _pooled(
         for channel in kind:
             own = told.get(channel, (middle, shared))[0]
             # One channel's few samples say less than all of its kind together.
-            sigma[channel] = max(LEAST, np.sqrt((own**2 + middle**2) / 2))
+            sigma[channel] = max(least, np.sqrt((own**2 + middle**2) / 2))
             rho[channel] = shared
     return Noise(sigma, rho, source)
 

@@ -47,7 +47,7 @@ REST = 0.3
 up for what the library does not know, and for a wrong form of what was found; a true one explains
 more."""
 MATERIAL = 0.3
-"""An effect is material if it explains an error of this share of the noise, ..."""
+"""An effect is material if it explains an error of this share of some joint's noise, ..."""
 SIZABLE = 0.25
 """... or is of at least this share of its typical size."""
 
@@ -135,9 +135,13 @@ class Selector:
         self.folds = _folds(replays)
         self.nominal = self.predicting(self.model((), nominal))
 
-    def run(self) -> tuple[Model, list[Round]]:
-        """The model that is left when nothing more is worth adding, and how it came about."""
-        model = self.nominal
+    def run(self, start: Model) -> tuple[Model, list[Round]]:
+        """The model that is left when nothing more is worth adding, and how it came about.
+
+        Args:
+          start: the nominal model, or one with effects that are known already.
+        """
+        model = start
         rounds: list[Round] = []
         while len(model.hypotheses) < MOST:
             chosen = self._round(model)
@@ -210,7 +214,7 @@ class Selector:
             return False
         if inside <= self.blur(before) or not self._explains(before, after):
             return False
-        return _material(after.hypotheses[-1], before, after)
+        return _material(after.hypotheses[-1], before, after, self.replays.measured.channel)
 
     def _started(self, model: Model, score: Score) -> tuple[tuple[Hypothesis, ...], Fit]:
         """A fit of a model with one effect more, where the score test says it lies."""
@@ -297,13 +301,16 @@ def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
     return chosen
 
 
-def _material(hypothesis: Hypothesis, before: Model, after: Model) -> bool:
-    """Whether an effect matters: by its size, or by the error it explains on motions left out."""
+def _material(
+    hypothesis: Hypothesis, before: Model, after: Model, channel: NDArray[np.int64]
+) -> bool:
+    """Whether an effect matters: by its size, or by the error it explains of some joint."""
     at = dict(zip(after.fit.names, after.fit.at, strict=True))
     if any(abs(at[name]) >= SIZABLE for name in hypothesis.magnitudes):
         return True
-    explained = float((before.held_out - after.held_out).sum()) / before.samples
-    return explained > MATERIAL**2
+    assert before.fit.residual is not None and after.fit.residual is not None
+    explained = np.bincount(channel, before.fit.residual**2 - after.fit.residual**2)
+    return bool((explained > MATERIAL**2 * np.bincount(channel)).any())
 
 
 def _without_samples(fit: Fit, inside: NDArray[np.bool_]) -> Fit:

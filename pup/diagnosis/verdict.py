@@ -133,7 +133,7 @@ def findings(
       measured: the samples.
       found: the regimes of motion.
     """
-    nominal = rounds[0].before
+    nominal = selector.nominal
     told = []
     for hypothesis in final.hypotheses:
         alone = len(final.hypotheses) == 1

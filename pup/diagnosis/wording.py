@@ -44,7 +44,7 @@ _QUANTITIES = {
     "sluggishness": "time per speed gained",
     "teeth": "ripples per turn",
 }
-_SLIDING = {
+SLIDING = {
     "rad": "m",
     "rad/s": "m/s",
     "N m": "N",
@@ -58,6 +58,7 @@ _SLIDING = {
     "s2/rad": "s2/m",
     "kg m2": "kg",
 }
+"""The units that are meant on a slide, by those of the library."""
 
 
 def spoken(name: str) -> str:
@@ -182,7 +183,7 @@ class Speech:
 
     def unit(self, unit: str) -> str:
         """The unit meant where the library says `unit`."""
-        return _SLIDING.get(unit, unit) if self.units.position == "m" else unit
+        return SLIDING.get(unit, unit) if self.units.position == "m" else unit
 
     def angle(self, value: float, count: int = 2) -> str:
         """A position, in degrees or mm, to some digits."""

@@ -1,0 +1,123 @@
+"""The search for what is missing: from the nominal fit to a model that holds.
+
+A motion that the nominal model loses track of, such as a limb that swings freely after the torque
+went off, says nothing by its slopes: errors of a radian are not small. It would also drag the
+nominal parameters with it. What is missing is then looked for in the other motions first, and the
+search goes on with all of them from what was found there.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.evidence import Trace, threshold
+from pup.diagnosis.fitting import Fit, differentiate, fit_together
+from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.nominal import Nominal
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Measured
+from pup.diagnosis.selection import Model, Round, Selector
+from pup.diagnosis.tracing import traces
+from pup.physics.terms.scale import Scale
+
+Array = NDArray[np.float64]
+
+FALSE_ALARMS = 0.002
+"""Chance that pure noise makes any hypothesis stand out."""
+ASTRAY, FAR = 0.5, 0.2
+"""A motion is lost where a joint is off by this share of what it moves, and by so much, rad."""
+LEFT = 1 / 3
+"""Share of all recordings that must be left for a first look."""
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search has found.
+
+    Attributes:
+      selector: which did it.
+      model: the model that is left.
+      rounds: how it came about.
+      found: traces of all hypotheses.
+      enough: surprise that chance does not reach.
+    """
+
+    selector: Selector
+    model: Model
+    rounds: tuple[Round, ...]
+    found: tuple[Trace, ...]
+    enough: float
+
+
+def search(
+    replays: Replays,
+    nominal: Nominal,
+    rng: np.random.Generator,
+    progress: Callable[[str, float], None],
+    first: Search | None = None,
+) -> Search | None:
+    """Look for effects; None where the motions would show none.
+
+    Args:
+      replays: simulates.
+      nominal: the fit of the nominal model.
+      rng: draws noise.
+      progress: told the stage and the share of all that is done.
+      first: what was found in some of the recordings.
+    """
+    progress("score test", 0.3)
+    base = nominal.fit if first is None else _carried(first, replays, nominal)
+    found = traces(hypotheses(replays.measured), base, replays, nominal.noise)
+    if not found:
+        return None
+    enough = threshold(found, rng, FALSE_ALARMS)
+    selector = Selector(replays, nominal.noise, found, enough, nominal.fit)
+    progress("refits", 0.5)
+    before: tuple[Round, ...] = ()
+    start = selector.nominal
+    if first is not None and base is not nominal.fit:
+        before, start = first.rounds, selector.model(first.model.hypotheses, base)
+    model, rounds = selector.run(start)
+    if model.fit.jacobian is None:
+        differentiate([model.fit], replays, nominal.noise)
+    return Search(selector, model, (*before, *rounds), tuple(found), enough)
+
+
+def _carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
+    """What was found in some recordings, fitted to all; the nominal fit where that is better."""
+    known = first.model.fit
+    fit = Fit(known.coordinates, known.at.copy(), fixed=known.fixed)
+    fit_together([fit], replays, nominal.noise)
+    if fit.chi2 >= nominal.fit.chi2:
+        return nominal.fit
+    if fit.jacobian is None:
+        differentiate([fit], replays, nominal.noise)
+    return fit
+
+
+def followed(nominal: Nominal, replays: Replays) -> list[int]:
+    """The recordings that the nominal model does not lose track of.
+
+    Empty where it loses none, or where too few are left: two types of motion, a third of all.
+    """
+    measured = replays.measured
+    errors = measured.values - replays([nominal.fit.row()])[0]
+    errors = np.where(np.isnan(errors), np.inf, errors)
+    every = range(len(measured.recordings))
+    kept = [i for i in every if not _lost(measured, errors, measured.only([i]))]
+    types = {measured.recordings[i].motion for i in kept}
+    few = len(kept) < LEFT * len(every) or len(types) < 2
+    return [] if few or len(kept) == len(every) else kept
+
+
+def _lost(measured: Measured, errors: Array, own: NDArray[np.bool_]) -> bool:
+    far = FAR * Scale.of(measured.robot).angle
+    for joint in range(len(measured.robot.joints)):
+        here = own & (measured.channel == joint)
+        if here.any():
+            off = float(np.sqrt(np.mean(errors[here] ** 2)))
+            if off > max(far, ASTRAY * float(np.std(measured.values[here]))):
+                return True
+    return False
