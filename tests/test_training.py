@@ -182,7 +182,7 @@ def test_training_outlives_a_runner(ray_here: None) -> None:
     """What was lost with it is counted, and another takes its place with the same weights."""
     with closing(Trainer(replace(TOY, runners=2))) as trainer:
         assert trainer.iterate().steps == 2048
-        first, _ = trainer._each_runner(lambda runner: os.getpid())
+        first, _ = trainer.each_runner(lambda runner: os.getpid())
         os.kill(first, signal.SIGKILL)
         struck = trainer.iterate()
         assert (struck.steps, struck.lost) == (1024, 1024)
@@ -191,7 +191,7 @@ def test_training_outlives_a_runner(ray_here: None) -> None:
                 break
             time.sleep(0.5)
         assert trainer.iterate().lost == 0
-        weights = trainer._each_runner(lambda r: r.module.policy.actor[0].weight.detach().numpy())
+        weights = trainer.each_runner(lambda r: r.module.policy.actor[0].weight.detach().numpy())
         assert np.array_equal(weights[0], weights[1])
         assert np.array_equal(weights[0], trainer.weights()["actor.0.weight"])
 

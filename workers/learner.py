@@ -14,7 +14,7 @@ from ray.rllib.core.columns import Columns
 
 from pup.policy.losses import Losses, LossWeights, Samples, TorchMirror, advantages, losses
 from pup.policy.mirror import MirrorMap
-from workers.module import PolicyModule
+from workers.module import PolicyModule, load
 from workers.rollouts import Fragment
 
 CHUNK = 16384
@@ -201,6 +201,7 @@ class MirrorLearner(PPOTorchLearner):
     def after_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
         """Normalisers learn after the steps: all of an iteration's samples share their statistics.
 
+        RLlib's schedules are left out: they follow counts that a restored training does not have.
         See Learner.
         """
         module = self.policy_module
@@ -249,7 +250,7 @@ class MirrorLearner(PPOTorchLearner):
         """Go on where another learner told its state."""
         policy = self.policy_module.policy
         weights = {k.removeprefix("policy/"): v for k, v in state.items() if k[:7] == "policy/"}
-        policy.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in weights.items()})
+        load(policy, weights)
         for name, parameter in policy.named_parameters():
             for key in ("step", "exp_avg", "exp_avg_sq"):
                 value = torch.from_numpy(state[f"adam/{key}/{name}"].copy()).to(parameter.device)

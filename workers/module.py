@@ -13,7 +13,11 @@ from pup.policy.shape import PolicyShape
 
 
 class PolicyModule(TorchRLModule, ValueFunctionAPI):
-    """Wraps a ProjectedPolicy; its shape and seed stand in the model's configuration."""
+    """Wraps a ProjectedPolicy.
+
+    The model's configuration holds its `shape`, the `seed` of its weights, and `start`, weights by
+    name in their place or None.
+    """
 
     def setup(self) -> None:
         """See RLModule."""
@@ -21,9 +25,8 @@ class PolicyModule(TorchRLModule, ValueFunctionAPI):
         with torch.random.fork_rng():
             torch.manual_seed(self.model_config["seed"])
             self.policy = ProjectedPolicy(shape)
-        start = self.model_config.get("start")
-        if start:
-            load(self.policy, start)
+        if self.model_config["start"]:
+            load(self.policy, self.model_config["start"])
 
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         """Logits of samples that hold an observation and mu."""
@@ -43,8 +46,3 @@ class PolicyModule(TorchRLModule, ValueFunctionAPI):
 def load(policy: ProjectedPolicy, weights: dict[str, np.ndarray]) -> None:
     """Give a policy weights and buffers by name; all of them and no others."""
     policy.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in weights.items()})
-
-
-def weights_of(policy: ProjectedPolicy) -> dict[str, np.ndarray]:
-    """A policy's weights and buffers by name."""
-    return {k: v.detach().cpu().numpy().copy() for k, v in policy.state_dict().items()}

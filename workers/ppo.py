@@ -146,7 +146,8 @@ def _numbers(told: dict[str, Any]) -> dict[str, float]:
 
 def _start(setup: Setup) -> BatchPPO:
     """Build the algorithm on the Ray this process is connected to."""
-    logging.getLogger("ray").setLevel(logging.ERROR)
+    for name in ("ray", "ray.rllib"):
+        logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     seen, done = spaces(setup.shape.proprioception, setup.shape.joints, setup.shape.bins)
     here = torch.cuda.is_available()
@@ -231,7 +232,7 @@ class Trainer:
     def state(self) -> State:
         """All that a training which goes on alike needs, as arrays by name."""
         told = {f"learner/{k}": v for k, v in self._learner().items()}
-        for i, runner in enumerate(self._each_runner(lambda one: one.sampler.state())):
+        for i, runner in enumerate(self.each_runner(lambda one: one.sampler.state())):
             told |= {f"runner{i}/{k}": v for k, v in runner.items()}
         return told
 
@@ -244,7 +245,7 @@ class Trainer:
         def give(runner: BatchRunner) -> None:
             runner.sampler.restore(states[max(0, runner.worker_index - 1)])
 
-        self._each_runner(give)
+        self.each_runner(give)
         self.algorithm.broadcast()
 
     def close(self) -> None:
@@ -256,7 +257,7 @@ class Trainer:
         (learner,) = (one.get() for one in told)
         return dict(learner)
 
-    def _each_runner(self, action: Callable[[BatchRunner], Any]) -> list[Any]:
+    def each_runner(self, action: Callable[[BatchRunner], Any]) -> list[Any]:
         """What the runners that sample answer, in their order."""
         group = self.algorithm.env_runner_group
         return list(group.foreach_env_runner(action, local_env_runner=not self.runners))

@@ -120,14 +120,17 @@ def losses(
     """PPO's losses of a minibatch, and the mirror loss of half of it."""
     count = len(samples.log)
     seen, parameters = samples.proprioception, samples.parameters
-    half = count // 2 if mirror is not None and weights.mirror > 0 else 0
-    if half:  # of the samples, which are shuffled: enough for a tendency, at half the price
+    half = 0
+    if (
+        mirror is not None and weights.mirror > 0
+    ):  # of the samples, which are shuffled: enough for a tendency, at half the price
+        half = count // 2
         seen = torch.cat([seen, mirror.observation(seen[:half])])
         parameters = torch.cat([parameters, parameters[:half, mirror.parameters]])
     whole = torch.log_softmax(policy(seen, parameters), dim=-2)
     log, other = whole.split([count, half])
     apart = whole.new_zeros(())
-    if half:
+    if mirror is not None and half:
         off = other.exp() - mirror.probabilities(log[:half].exp())
         apart = off.square().sum() / (half * policy.shape.joints)
     change = log_probability(log, samples.bins) - samples.log

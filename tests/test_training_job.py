@@ -1,0 +1,44 @@
+"""`pup train` as a user has it, in a process of its own: stopped, resumed, and shown walking."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from commandline import pup
+from jobs import Job
+
+pytest.importorskip("torch")
+pytest.importorskip("gymnasium")
+
+SMALL = ("--simulations", 4, "--length", 8, "--minibatch", 16, "--cores", 1)
+
+
+@pytest.mark.ray
+def test_a_stopped_training_says_so_and_leaves_nothing_running(tmp_path: Path) -> None:
+    """Exit code 130, no process of its Ray; a walk of what it left afterwards, and its refusals."""
+    out = tmp_path / "out"
+    job = Job("train", *SMALL, "--steps", 10**9, out=out)
+    job.come_to("ray")
+    job.come_to("tensorboard/events*")
+    os.kill(job.pid, signal.SIGTERM)
+    code, printed, told = job.end()
+    assert (code, printed) == (130, ""), told
+    assert told.splitlines()[-1] == "pup train: stopped; the same command resumes"
+    job.assert_nothing_left()
+    job = Job("train", *SMALL, "--steps", 1000, out=tmp_path / "short")
+    code, printed, told = job.end()
+    assert code == 0, told
+    job.assert_nothing_left()
+    policy = tmp_path / "short" / "policy"
+    walk = ("replay", "--policy", policy, "--robot", "darwin_op2", "--episodes", 4, "--json")
+    shown = pup(*walk, "--out", tmp_path / "walk").json()
+    assert len(shown["distance"]) == len(shown["fell"]) == 4
+    assert shown["shown"]["time"] > 0
+    assert (tmp_path / "walk" / "gait.png").read_bytes().startswith(b"\x89PNG")
+    assert Path(shown["video"]).stat().st_size > 1000
+    assert shown["drawn_by"] in ("mujoco", "matplotlib")
+    assert pup(*walk, "--out", tmp_path / "other", "--eta", "0,0").code == 2
+    leg = ("replay", "--policy", policy, "--robot", "darwin_leg", "--out", tmp_path / "other")
+    refused = pup(*leg)
+    assert refused.code == 2 and "'darwin_op2'" in refused.err
