@@ -68,7 +68,7 @@ class Work:
 def main() -> None:
     options = parser(__doc__, rounds=3)
     options.add_argument("--simulations", type=int, default=256)
-    options.add_argument("--length", type=int, default=80)
+    options.add_argument("--length", type=int, default=24)
     given = options.parse_args()
     logging.getLogger("ray").setLevel(logging.ERROR)
     report = Report("training", given.json)

@@ -68,7 +68,7 @@ class Options:
     steps: int = 15_000_000
     seed: int = 0
     simulations: int = 256
-    length: int = 80
+    length: int = 24
     learning: Learning = field(default_factory=Learning)
     runners: int = 0
     start: Path | None = None

@@ -43,7 +43,7 @@ class Learning:
     """
 
     epochs: int = 4
-    minibatch: int = 2048
+    minibatch: int = 1536
     rate: float = 1e-3
     schedule: Literal["linear", "adaptive", "constant"] = "linear"
     divergence: float = 0.01
