@@ -353,3 +353,24 @@ def test_a_bundle_of_another_robot_is_refused(bundle: Path) -> None:
     """By its joints too."""
     refused(bundle, "'darwin_op2'", "'servo_bench'", robot=RobotDescription.load("servo_bench"))
     refused(bundle, "20 joints", robot=replace(ROBOT, joints=ROBOT.joints[::-1]))
+
+
+def test_targets_are_those_of_the_task(bundle: Path) -> None:
+    """What a robot is sent is what was trained: reference, reach, smoothing and limits."""
+    from pup.locomotion.sampling import ParameterSampler
+    from pup.locomotion.settings import TaskSettings
+    from pup.locomotion.task import WalkingTask
+    from pup.sysid.result import read_bounds
+
+    run, rng = NumpyPolicy.load(bundle), np.random.default_rng(3)
+    sampler = ParameterSampler(read_bounds(ROBOT.identified_path, ROBOT))
+    task = WalkingTask(ROBOT, sampler, TaskSettings(), 2, rng, 1)
+    task.reset()
+    sent: list[np.ndarray] = []
+    move = task._simulations.step
+    task._simulations.step = lambda target, live: sent.append(target[0]) or move(target, live)
+    bins, time = rng.integers(0, 11, (12, 20)), 0.0
+    for i in range(len(bins)):
+        told = task.step(np.stack([bins[i], bins[i]]))
+        np.testing.assert_allclose(sent[-1], run.targets(time, bins[: i + 1]), atol=1e-9)
+        time = float(told.time[0])
