@@ -1,0 +1,258 @@
+"""Which eta to try next, and which to keep (paper, section V).
+
+A few uniform trials, or simulated rollouts in their place, then each trial where noisy expected
+improvement on the Gaussian process is largest; at the end the tried eta with the largest posterior
+mean, so that one lucky walk does not decide. Everything is a function of the data, the number of
+the trial and the seed: whoever is stopped and asks again is told the same.
+"""
+
+import hashlib
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from botorch.acquisition.logei import qLogNoisyExpectedImprovement
+from botorch.optim import optimize_acqf
+from botorch.sampling import SobolQMCNormalSampler
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from pup.errors import InputError
+from pup.transfer.study import Eta, Purpose
+from pup.transfer.surrogate import Landscapes, Simulated, Surrogate, Told, landscapes, surrogate_of
+
+Array = NDArray[np.float64]
+
+CANDIDATES = 512
+"""Etas of a low-discrepancy sequence whose acquisition is looked at."""
+NEARBY = 128
+"""Etas around the best ones so far."""
+STARTS = 4
+"""Best of them, from which the acquisition is climbed."""
+SAMPLES = 64
+"""Draws of the process that expected improvement is averaged over."""
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What is searched, and what is known of it.
+
+    Attributes:
+      lower: of the box of eta.
+      upper: likewise.
+      initial: uniform trials.
+      seed: of everything random.
+      eta: of the walks so far, shape (n, n_eta).
+      distance: of them, m, shape (n,).
+      simulated: rollouts to start from, or None.
+    """
+
+    lower: Eta
+    upper: Eta
+    initial: int
+    seed: int
+    eta: Array
+    distance: Array
+    simulated: Simulated | None = None
+
+    def __post_init__(self) -> None:
+        if self.eta.shape != (len(self.distance), len(self.lower)):
+            raise InputError(f"etas of shape {self.eta.shape} for {len(self.distance)} distances")
+        if not (np.isfinite(self.eta).all() and np.isfinite(self.distance).all()):
+            raise InputError("etas and distances must be finite")
+        if self.simulated and self.simulated.eta.shape[1] != len(self.lower):
+            raise InputError("simulated rollouts have another number of etas than the study")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the walks: which data a decision was made on."""
+        return hashlib.sha256(self.eta.tobytes() + self.distance.tobytes()).hexdigest()
+
+    @property
+    def told(self) -> Told:
+        """The walks, on the unit cube."""
+        return Told(self._unit(self.eta), self.distance)
+
+    @property
+    def prior(self) -> Landscapes | None:
+        """The simulated rollouts as landscapes on the unit cube."""
+        if self.simulated is None:
+            return None
+        return landscapes(self.simulated, np.array(self.lower), np.array(self.upper))
+
+    def real(self, unit: Array) -> Array:
+        """Etas of the box from those of the unit cube."""
+        low, high = np.array(self.lower), np.array(self.upper)
+        return np.clip(low + unit * (high - low), low, high)
+
+    def _unit(self, eta: Array) -> Array:
+        low, high = np.array(self.lower), np.array(self.upper)
+        return np.asarray((eta - low) / (high - low))
+
+
+@dataclass(frozen=True)
+class Decision:
+    """An eta and why.
+
+    Attributes:
+      eta: decided on.
+      purpose: of the trial; that of a choice is to repeat it.
+      why: how it was found, in words.
+      walks: number of walks it was decided on.
+      digest: SHA-256 of them.
+      mean: expected distance, m; None without a process.
+      deviation: of the expectation, m.
+      acquisition: logarithm of the expected improvement; None where it did not decide.
+      hyperparameters: of the process.
+      seconds: that it took.
+    """
+
+    eta: Eta
+    purpose: Purpose
+    why: str
+    walks: int
+    digest: str
+    mean: float | None = None
+    deviation: float | None = None
+    acquisition: float | None = None
+    hyperparameters: dict[str, Any] | None = None
+    seconds: float = 0.0
+
+
+def suggest(search: Search, number: int) -> Decision:
+    """The eta of the next trial.
+
+    Args:
+      search: what is known.
+      number: of the trial in its study, from 1; another one draws other numbers.
+    """
+    began = time.perf_counter()
+    if search.simulated is None and len(search.distance) < search.initial:
+        eta = search.real(_uniform(len(search.lower), search.seed, number)[None])[0]
+        return Decision(
+            tuple(eta.tolist()),
+            Purpose.INITIAL,
+            f"uniform, walk {len(search.distance) + 1} of {search.initial}",
+            len(search.distance),
+            search.digest,
+            seconds=time.perf_counter() - began,
+        )
+    surrogate = surrogate_of(search.told, search.prior)
+    rng = np.random.default_rng((search.seed, number))
+    if len(search.distance):
+        unit, value = _improve(surrogate, search.told, rng)
+        why = "largest noisy expected improvement"
+    else:
+        candidates = _candidates(len(search.lower), rng)
+        unit, value = candidates[np.argmax(surrogate.predict(candidates)[0])], None
+        why = "best in simulation"
+    return _decision(search, surrogate, unit, Purpose.SEARCH, why, value, began)
+
+
+def choose(search: Search) -> Decision:
+    """The eta to keep: of those tried, the one with the largest posterior mean."""
+    began = time.perf_counter()
+    if not len(search.distance):
+        raise InputError("nothing was walked yet, so nothing can be chosen")
+    surrogate = surrogate_of(search.told, search.prior)
+    unit = search.told.eta[np.argmax(surrogate.predict(search.told.eta)[0])]
+    why = "largest posterior mean of the etas tried"
+    return _decision(search, surrogate, unit, Purpose.REPEAT, why, None, began)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The process along one entry of eta, the others as in the best.
+
+    Attributes:
+      entry: of eta, from 0.
+      eta: its values.
+      mean: m.
+      deviation: m.
+    """
+
+    entry: int
+    eta: tuple[float, ...]
+    mean: tuple[float, ...]
+    deviation: tuple[float, ...]
+
+
+def slices(search: Search, points: int = 41) -> tuple[Slice, ...]:
+    """The process through the eta that would be chosen now, a slice for each entry."""
+    surrogate = surrogate_of(search.told, search.prior)
+    best = search.told.eta[np.argmax(surrogate.predict(search.told.eta)[0])]
+    drawn = []
+    for entry in range(len(search.lower)):
+        line = np.tile(best, (points, 1))
+        line[:, entry] = np.linspace(0, 1, points)
+        mean, deviation = surrogate.predict(line)
+        real = search.real(line)[:, entry]
+        drawn.append(
+            Slice(entry, tuple(real.tolist()), tuple(mean.tolist()), tuple(deviation.tolist()))
+        )
+    return tuple(drawn)
+
+
+def _decision(
+    search: Search,
+    surrogate: Surrogate,
+    unit: Array,
+    purpose: Purpose,
+    why: str,
+    value: float | None,
+    began: float,
+) -> Decision:
+    mean, deviation = surrogate.predict(unit[None])
+    return Decision(
+        tuple(search.real(unit[None])[0].tolist()),
+        purpose,
+        why,
+        len(search.distance),
+        search.digest,
+        float(mean[0]),
+        float(deviation[0]),
+        value,
+        surrogate.hyperparameters,
+        time.perf_counter() - began,
+    )
+
+
+def _uniform(n_eta: int, seed: int, number: int) -> Array:
+    """A point of a scrambled Sobol sequence: uniform, and far from the others."""
+    drawn = qmc.Sobol(n_eta, rng=np.random.default_rng(seed)).random_base2(number.bit_length())
+    return np.asarray(drawn[number - 1])
+
+
+def _candidates(n_eta: int, rng: np.random.Generator) -> Array:
+    return np.asarray(qmc.Sobol(n_eta, rng=rng).random(CANDIDATES))
+
+
+def _improve(surrogate: Surrogate, told: Told, rng: np.random.Generator) -> tuple[Array, float]:
+    """Where the logarithm of noisy expected improvement is largest, and how large."""
+    n_eta = told.eta.shape[1]
+    torch.manual_seed(int(rng.integers(2**31)))
+    acquisition = qLogNoisyExpectedImprovement(
+        surrogate.model,
+        torch.as_tensor(told.eta),
+        sampler=SobolQMCNormalSampler(torch.Size([SAMPLES]), seed=int(rng.integers(2**31))),
+        prune_baseline=False,
+    )
+    means, _ = surrogate.predict(told.eta)
+    best = told.eta[np.argsort(-means)[:3]]
+    around = best[rng.integers(len(best), size=NEARBY)] + rng.normal(0, 0.1, (NEARBY, n_eta))
+    tried = np.vstack([_candidates(n_eta, rng), np.clip(around, 0, 1)])
+    with torch.no_grad():
+        values = acquisition(torch.as_tensor(tried).unsqueeze(1)).numpy()
+    starts = torch.as_tensor(tried[np.argsort(-values)[:STARTS]]).unsqueeze(1)
+    bounds = torch.tensor([[0.0] * n_eta, [1.0] * n_eta], dtype=torch.double)
+    found, value = optimize_acqf(
+        acquisition,
+        bounds,
+        q=1,
+        num_restarts=STARTS,
+        batch_initial_conditions=starts,
+        options={"maxiter": 25},
+    )
+    return found[0].clamp(0, 1).numpy(), float(value)

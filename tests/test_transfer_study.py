@@ -1,0 +1,248 @@
+"""Trials and studies: what may follow what, under any order of reports, repeats and losses."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pup.errors import InputError
+from pup.transfer.study import (
+    HANDED_OUT,
+    OPEN,
+    TOLD,
+    Choose,
+    Finish,
+    Purpose,
+    Result,
+    Study,
+    StudySettings,
+    StudyState,
+    Suggest,
+    Ticket,
+    Trial,
+    TrialError,
+    TrialState,
+    Verdict,
+    Wait,
+    Walk,
+    next_step,
+)
+
+S = TrialState
+SETTINGS = StudySettings(robot="darwin_op2", policy="0" * 64)
+AFTER = {
+    S.REQUESTED: {S.ASSIGNED, S.ABORTED},
+    S.ASSIGNED: {S.ARMED, S.RUNNING, S.SUCCEEDED, S.ABORTED, S.INFEASIBLE, S.LOST},
+    S.ARMED: {S.RUNNING, S.SUCCEEDED, S.ABORTED, S.INFEASIBLE, S.LOST},
+    S.RUNNING: {S.SUCCEEDED, S.ABORTED, S.INFEASIBLE, S.LOST},
+    S.ABORTED: {S.REQUESTED},
+    S.LOST: {S.REQUESTED},
+    S.SUCCEEDED: set(),
+    S.INFEASIBLE: set(),
+}
+"""What may follow a state; reports may have been lost in between."""
+
+
+def fresh(number=1):
+    return Trial("s", number, (0.0, 0.0, 0.0), Purpose.SEARCH)
+
+
+tickets = st.builds(
+    Ticket, st.integers(1, 3), st.integers(0, 4), st.sampled_from(["darwin-1", "darwin-2"])
+)
+results = st.builds(
+    Result,
+    st.sampled_from([S.SUCCEEDED, S.ABORTED, S.INFEASIBLE]),
+    st.none() | st.floats(-1, 2),
+)
+events = st.one_of(
+    st.tuples(st.just("release")),
+    st.tuples(st.just("assign"), st.sampled_from(["darwin-1", "darwin-2"]), st.integers(0, 6)),
+    st.tuples(st.just("report"), tickets, st.sampled_from([S.ARMED, S.RUNNING])),
+    st.tuples(st.just("finish"), tickets, results),
+    st.tuples(st.just("expire")),
+    st.tuples(st.just("withdraw"), st.just("")),
+    st.tuples(st.just("retry"), st.integers(1, 4)),
+)
+
+
+@given(st.lists(events, max_size=60))
+def test_no_history_breaks_a_rule(history):
+    trial, counted, fences = fresh(), [], [0]
+    for name, *given_ in history:
+        before = trial
+        try:
+            changed = getattr(trial, name)(*given_)
+        except TrialError:
+            continue
+        trial, verdict = changed if isinstance(changed, tuple) else (changed, None)
+        if verdict not in (None, Verdict.COUNTED):
+            assert trial == before, "only what counts changes a trial"
+        if trial.state is not before.state:
+            assert trial.state in AFTER[before.state]
+        if name == "assign":
+            assert trial.fence > max(fences), "a fence only grows"
+            fences.append(trial.fence)
+        if name == "finish" and verdict is Verdict.COUNTED:
+            ticket = given_[0]
+            assert before.state in HANDED_OUT
+            assert ticket == Ticket(before.attempt, before.fence, before.agent)
+            counted.append((trial.attempt, trial.fence))
+        assert trial.attempt == before.attempt or name == "retry", "only an operator retries"
+        assert trial.result is None or trial.state not in OPEN
+        if trial.state in TOLD and trial.state is S.SUCCEEDED:
+            assert trial.result.distance is not None
+    assert len(counted) == len(set(counted)), "no handing-out counts twice"
+
+
+def handed_out(fence=3):
+    return fresh().release().assign("darwin-1", fence), Ticket(1, fence, "darwin-1")
+
+
+@given(st.permutations([S.ARMED, S.RUNNING, S.ARMED, S.RUNNING]))
+def test_reports_in_any_order_lead_to_running(order):
+    trial, ticket = handed_out()
+    for state in order:
+        trial, _ = trial.report(ticket, state)
+    assert trial.state is S.RUNNING
+
+
+def test_a_result_counts_once_and_the_first_one():
+    trial, ticket = handed_out()
+    trial, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7))
+    assert verdict is Verdict.COUNTED
+    again, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.1))
+    assert verdict is Verdict.REPEATED and again == trial and trial.result.distance == 0.7
+
+
+def test_a_result_after_the_lease_is_late():
+    trial, ticket = handed_out()
+    trial = trial.expire()
+    after, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7))
+    assert verdict is Verdict.LATE and after.state is S.LOST
+
+
+def test_a_result_of_an_earlier_attempt_is_late_whatever_the_newer_one_does():
+    trial, ticket = handed_out()
+    trial = trial.expire().retry(2)
+    for now in (trial, trial.assign("darwin-2", 4)):
+        after, verdict = now.finish(ticket, Result(S.SUCCEEDED, 0.7))
+        assert verdict is Verdict.LATE and after == now
+
+
+@pytest.mark.parametrize(
+    "ticket", [Ticket(1, 3, "darwin-2"), Ticket(2, 3, "darwin-1"), Ticket(1, 9, "darwin-1")]
+)
+def test_results_of_what_was_never_handed_out_are_unknown(ticket):
+    trial, _ = handed_out()
+    assert trial.finish(ticket, Result(S.SUCCEEDED, 0.7)) == (trial, Verdict.UNKNOWN)
+
+
+def test_a_success_without_a_distance_is_no_data_point():
+    trial, ticket = handed_out()
+    trial, _ = trial.finish(ticket, Result(S.SUCCEEDED))
+    assert trial.state is S.ABORTED and "distance" in trial.result.reason
+
+
+def test_an_operator_retries_once_however_often_asked():
+    trial = handed_out()[0].expire()
+    assert trial.retry(2) == trial.retry(2).retry(2)
+    with pytest.raises(TrialError, match="next is 2"):
+        trial.retry(3)
+    with pytest.raises(TrialError, match="only aborted or lost"):
+        handed_out()[0].retry(2)
+
+
+def test_the_gate_holds():
+    with pytest.raises(TrialError):
+        fresh().assign("darwin-1", 1)
+    with pytest.raises(TrialError, match="must exceed"):
+        handed_out()[0].expire().retry(2).assign("darwin-1", 3)
+
+
+def play(settings, outcomes):
+    """A study from start to end, with given outcomes of its walks in a row."""
+    study, fence, made = Study("s", settings), 0, []
+    outcomes = iter(outcomes)
+    for _ in range(1000):
+        match next_step(study):
+            case Suggest():
+                initial = len(study.searched) < settings.initial
+                purpose = Purpose.INITIAL if initial else Purpose.SEARCH
+                eta = (float(len(study.trials)),) * 3
+            case Choose():
+                study = Study(
+                    "s", settings, fence=fence, chosen=study.searched[0].eta, trials=study.trials
+                )
+                continue
+            case Walk(eta, purpose):
+                pass
+            case Finish():
+                return study, made
+            case Wait():
+                raise AssertionError("a study waits for nothing")
+        fence += 1
+        trial = Trial("s", len(study.trials) + 1, eta, purpose).release().assign("a", fence)
+        study = study.with_trial(trial)
+        assert isinstance(next_step(study), Wait), "one trial at a time"
+        trial, _ = trial.finish(Ticket(1, fence, "a"), next(outcomes))
+        study = study.with_trial(trial)
+        made.append(trial)
+    raise AssertionError("a study does not end")
+
+
+@given(
+    st.integers(1, 8),
+    st.integers(0, 3),
+    st.lists(st.sampled_from([S.SUCCEEDED, S.ABORTED, S.INFEASIBLE]), max_size=12),
+)
+def test_a_study_ends_with_as_many_walks_as_were_asked_for(trials, repeats, bad):
+    settings = StudySettings(
+        "r", "p", trials=trials, initial=1, repeats=repeats, compare=((0.5, 0.5, 0.5),)
+    )
+    outcomes = itertools.chain(
+        (Result(s, 0.1) for s in bad), itertools.repeat(Result(S.SUCCEEDED, 1.0))
+    )
+    study, made = play(settings, outcomes)
+    assert len(study.searched) == trials
+    count = {p: sum(t.purpose is p and t.state in TOLD for t in made) for p in Purpose}
+    assert count[Purpose.REPEAT] == count[Purpose.COMPARE] == repeats
+
+
+def test_the_chosen_eta_and_its_rivals_take_turns():
+    settings = StudySettings("r", "p", trials=1, initial=1, repeats=3, compare=((9.0,) * 3,))
+    _, made = play(settings, itertools.repeat(Result(S.SUCCEEDED, 1.0)))
+    assert [t.purpose for t in made[1:]] == [Purpose.REPEAT, Purpose.COMPARE] * 3
+
+
+def test_a_pause_makes_no_trials():
+    assert isinstance(next_step(Study("s", SETTINGS, state=StudyState.PAUSED)), Wait)
+
+
+def test_failures_in_a_row_are_counted():
+    study = Study("s", SETTINGS)
+    ends = [S.SUCCEEDED, S.ABORTED, S.ABORTED]
+    for number, state in enumerate(ends, 1):
+        trial = fresh(number).release().assign("a", number)
+        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0))
+        study = study.with_trial(trial)
+    assert study.failures() == 2
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"lower": (0.0,), "upper": (1.0, 1.0)},
+        {"lower": (1.0,) * 3},
+        {"lower": (float("nan"),) * 3},
+        {"upper": (float("inf"),) * 3},
+        {"compare": ((0.0,),)},
+        {"compare": ((0.0, 0.0, float("nan")),)},
+        {"initial": 0},
+        {"initial": 26},
+    ],
+)
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(InputError):
+        StudySettings("r", "p", **wrong)
