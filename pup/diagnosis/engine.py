@@ -132,7 +132,7 @@ def diagnose(
     reason = _too_poor(measured)
     if reason:
         return told("undetermined", reason)
-    first = _first_look(nominal, replays, runner, rng, progress)
+    first = _first_look(nominal, replays, rng, progress)
     if first is not None:
         nominal = replace(nominal, certificate=first[0].certificate)
     if not nominal.certificate.holds:
@@ -170,20 +170,14 @@ def diagnose(
 
 
 def _first_look(
-    nominal: Nominal,
-    replays: Replays,
-    runner: Callable[[Measured], Runner],
-    rng: np.random.Generator,
-    progress: Progress,
+    nominal: Nominal, replays: Replays, rng: np.random.Generator, progress: Progress
 ) -> tuple[Nominal, Search] | None:
     """What is missing in the motions that the nominal model can follow, where it loses others."""
     kept = followed(nominal, replays)
     if not kept:
         return None
-    recordings = replays.measured.recordings
-    part = Measured.of(replays.measured.robot, [recordings[i] for i in kept])
-    some = Replays(part, replays.space, runner(part), replays.lanes)
-    fitted = fit_nominal(some, assumed_noise(part), rng)
+    some = replays.narrowed(kept)
+    fitted = fit_nominal(some, assumed_noise(some.measured), rng)
     found = search(some, fitted, rng, progress) if fitted.certificate.holds else None
     replays.simulated += some.simulated
     return None if found is None else (fitted, found)

@@ -109,6 +109,7 @@ class Fit:
       width: of its finite differences, in their usual one.
       slack: relative gain of chi-squared below which it has ended.
       stuck: times in a row that no trial was better.
+      moved: whether any was so far.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -124,6 +125,7 @@ class Fit:
     damping: float = 1e-2
     age: int = 0
     stuck: int = 0
+    moved: bool = False
     width: float = 1.0
     slack: float = 1e-5
 
@@ -182,6 +184,26 @@ def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations
                 fit,
                 [told for (owner, _), told in zip(trials, reached, strict=True) if owner is fit],
             )
+
+
+def start_best(
+    fits: Sequence[Fit], options: Sequence[Sequence[Array]], replays: Replays, noise: Noise
+) -> None:
+    """Let each fit start where it is best.
+
+    Args:
+      fits: changed in place.
+      options: coordinates that each may start at.
+      replays: simulates.
+      noise: weighs the samples.
+    """
+    tried = [(fit, at) for fit, places in zip(fits, options, strict=True) for at in places]
+    simulated = replays([fit.row(at) for fit, at in tried])
+    residuals = _residuals([fit for fit, _ in tried], simulated, replays, noise)
+    for (fit, at), residual in zip(tried, residuals, strict=True):
+        chi2 = _chi2(fit, residual)
+        if chi2 < fit.chi2:
+            fit.at, fit.residual, fit.chi2 = at, residual, chi2
 
 
 def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
@@ -346,14 +368,14 @@ def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
     if gain > 0:
         _go(fit, reached[best], costs[best])
         fit.damping = float(np.clip(fit.damping * _dampings(fit)[best], 1e-6, 1e6))
-        fit.stuck = 0
+        fit.stuck, fit.moved = 0, True
     if gain > fit.least:
         if fit.thorough and fit.age > 0 and (fit.age >= PATIENCE or not kept):
             fit.jacobian = None
     elif gain <= 0 and fit.stuck < 2:
         fit.damping *= 10 if fit.stuck == 0 else 1000
         fit.stuck += 1
-    elif fresh or not fit.thorough:
+    elif fresh or (fit.moved and not fit.thorough):
         fit.done = True
     else:
         fit.jacobian = None

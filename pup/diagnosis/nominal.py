@@ -10,16 +10,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import Coordinate, Fit, differentiate, fit_together, nominal_coordinate
+from pup.diagnosis.fitting import (
+    Coordinate,
+    Fit,
+    differentiate,
+    fit_together,
+    nominal_coordinate,
+    start_best,
+)
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise, noise_floor
 from pup.physics.parameters import ParameterSpace
 
 Array = NDArray[np.float64]
 
-STARTS = 3
+STARTS, LANDED = 3, 2
+FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
+"""Frictions that a fit may start from on the ground."""
 SPREAD = 0.35
 """Of the starts around the nominal values, in logarithms."""
+NEAR = 0.1
+"""Spread of a start around the best fit, where far ones disagree."""
 AGREEMENT = 3e-3
 """Two starts agree in chi-squared to this share of it, to ABSOLUTE, or to EXCESS of what is more
 than noise: where much is missing, a fit has many ends that lack it all the same."""
@@ -94,11 +105,16 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     coordinates = tuple(nominal_coordinate(space, n) for n in free_names(space, ground))
     spreads = [0.0] + [SPREAD] * (STARTS - 1)
     tried = [_start(coordinates, space, spread, rng) for spread in spreads]
+    tried = _landed(tried, replays, first)
     fit_together(tried, replays, first)
     tried.sort(key=lambda fit: fit.chi2)
     noise = noise_floor(measured, measured.values - replays([tried[0].row()])[0])
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
+    if not _agree(*fits):
+        fits = [min(fits, key=lambda fit: fit.chi2)]
+        fits.append(_nearby(fits[0], rng))
+        fit_together(fits, replays, noise)
     for width in WIDER:
         if _agree(*fits):
             break
@@ -111,6 +127,41 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
         differentiate([best], replays, noise)
     own = _refit_of_itself(best, replays, noise, rng)
     return Nominal(best, noise, Certificate((best.chi2, second.chi2), agreed, own))
+
+
+def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
+    """Fits to begin with on the ground: brought near in the air, then on the floor that suits each.
+
+    Recordings without contact cost a fifth, and gains that are far off would make the robot fall,
+    which teaches nothing; so does a floor on which it slips. The best are returned.
+    """
+    recordings = replays.measured.recordings
+    air = [i for i, r in enumerate(recordings) if r.support != "ground"]
+    if len(air) == len(recordings):
+        return list(fits)
+    if air:
+        part = replays.narrowed(air)
+        moved = [Fit(fit.coordinates, fit.at, slack=fit.slack) for fit in fits]
+        fit_together(moved, part, noise)
+        replays.simulated += part.simulated
+        for fit, found in zip(fits, moved, strict=True):
+            fit.at = found.at
+    start_best(fits, [_floors(fit) for fit in fits], replays, noise)
+    return sorted(fits, key=lambda fit: fit.chi2)[:LANDED]
+
+
+def _floors(fit: Fit) -> list[Array]:
+    """Where a fit stands, with floors of different friction."""
+    if "ground_friction" not in fit.names:
+        return [fit.at]
+    own = fit.names.index("ground_friction")
+    floor = fit.coordinates[own]
+    places = []
+    for friction in FLOORS:
+        at = fit.at.copy()
+        at[own] = floor.coordinate(friction)
+        places.append(at)
+    return places
 
 
 def _agree(first: Fit, second: Fit) -> bool:
@@ -131,8 +182,18 @@ def _start(
         c.coordinate(space.nominal[space.names.index(c.name)]) + spread * rng.normal()
         for c in coordinates
     ]
+    return Fit(tuple(coordinates), _within(coordinates, np.array(at)), slack=ROUGH)
+
+
+def _nearby(fit: Fit, rng: np.random.Generator) -> Fit:
+    """A start near a fit: contact has many hollows, and the deepest must draw what is near it."""
+    away = NEAR * rng.normal(size=len(fit.at))
+    return Fit(fit.coordinates, _within(fit.coordinates, fit.at + away))
+
+
+def _within(coordinates: Sequence[Coordinate], at: Array) -> Array:
     low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
-    return Fit(tuple(coordinates), np.clip(at, low, high), slack=ROUGH)
+    return np.clip(at, low, high)
 
 
 def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator) -> float:
@@ -140,11 +201,10 @@ def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Ge
     # What the model leaves counts as noise here too: nothing is known better than that.
     misfit = max(1.0, fit.chi2 / len(replays.measured.values))
     deviation = np.sqrt(misfit * np.diag(fit.covariance()))
-    low, high = ([getattr(c, end) for c in fit.coordinates] for end in ("lower", "upper"))
     simulated, off = replays([fit.row()])[0], np.inf
     for _ in range(SELVES):  # a kink on the way says nothing of where the way leads
         away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
-        start = np.clip(fit.at + away, low, high)
+        start = _within(fit.coordinates, fit.at + away)
         own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1)
         fit_together([own], replays, noise, iterations=8)
         off = min(off, float(np.max(np.abs(own.at - fit.at) / deviation)))

@@ -145,6 +145,18 @@ class Replays:
             [(self._batches(rows, tuple(chosen), None), len(rows)) for rows, chosen in asked]
         )
 
+    def narrowed(self, recordings: Sequence[int]) -> "Replays":
+        """Replays of some of the recordings, as if there were no others."""
+        chosen = [self.measured.recordings[i] for i in recordings]
+
+        def run(batches: Sequence[Batch]) -> list[Array]:
+            return self.runner(
+                [replace(b, recordings=tuple(recordings[i] for i in b.recordings)) for b in batches]
+            )
+
+        part = Measured.of(self.measured.robot, chosen)
+        return Replays(part, self.space, run, self.lanes)
+
     def _run(self, calls: Sequence[tuple[list[Batch], int]]) -> list[Array]:
         answers = iter(self.runner([batch for batches, _ in calls for batch in batches]))
         out = []

@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Score, Trace, project_again, scores
-from pup.diagnosis.fitting import Coordinate, Fit, differentiate, fit_together, term_coordinate
+from pup.diagnosis.fitting import (
+    Coordinate,
+    Fit,
+    differentiate,
+    fit_together,
+    start_best,
+    term_coordinate,
+)
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
@@ -29,6 +36,10 @@ FIRST, ROUGH = 2, 5
 """Steps after which finalists are compared for the first time, and in which they are."""
 ROUGHLY = 1e-3
 """Relative gain of chi-squared at which a finalist's fit may end."""
+SHARES = (1.0, 0.4)
+"""Shares of its linear size at which a finalist may start."""
+DAMPED, FURTHEST = 0.01, 0.5
+"""Damping and reach of the step that the other coordinates may take with it."""
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
@@ -173,6 +184,10 @@ class Selector:
             return None
         shortlist = _shortlist(ranking, self.enough)
         tried = [self._started(model, score) for score in shortlist]
+        options = [
+            _options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
+        ]
+        start_best([f for _, f in tried], options, self.replays, self.noise)
         self._refit([fit for _, fit in tried], fit.chi2)
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
@@ -291,6 +306,27 @@ class Selector:
         for inside, simulated in zip(insides, told, strict=True):
             predicted[inside] = np.where(np.isnan(simulated[0]), LOST, simulated[0])
         return replace(model, predicted=predicted)
+
+
+def _options(before: Fit, score: Score, fit: Fit) -> list[Array]:
+    """Where a finalist may start: all or some of what slopes promise, with or without the others.
+
+    Many an effect acts from some size on, and then more than its slope says.
+    """
+    assert before.jacobian is not None and before.residual is not None
+    n, trace = len(before.at), score.trace.whole
+    sizes = fit.at[n : n + trace.shape[1]]
+    normal = before.jacobian.T @ before.jacobian
+    normal[np.diag_indices(n)] *= 1 + DAMPED
+    low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
+    options = []
+    for share in SHARES:
+        at = fit.at.copy()
+        at[n : n + len(sizes)] = share * sizes
+        left = before.jacobian.T @ (before.residual - trace @ (share * sizes))
+        step = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
+        options += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
+    return options
 
 
 def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
