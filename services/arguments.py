@@ -52,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
         ("replay", "simulate recordings and compare, or let a policy walk", _replay),
         ("diagnose", "say what physics the simulator leaves out, and model it", _diagnose),
         ("blind", "make, diagnose or score a sealed set of concealed cases", _blind),
+        ("virtual-robot", "be a robot on pseudo-terminals, until stopped", _virtual_robot),
     ):
         verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
         fill(verb)
@@ -306,3 +307,35 @@ def _blind_score(action: argparse.ArgumentParser) -> None:
 def _paths(action: argparse.ArgumentParser, *wanted: tuple[str, str, str]) -> None:
     for option, metavar, told in wanted:
         action.add_argument(option, type=Path, required=True, metavar=metavar, help=told)
+
+
+def _virtual_robot(verb: argparse.ArgumentParser) -> None:
+    robot(verb, default=DEFAULT_ROBOT, more="; default: %(default)s")
+    seed(verb, ", its physics included")
+    for name, told in (
+        ("--link", "where the Dynamixel bus shall be found, a link to a pseudo-terminal"),
+        ("--imu", "the same for the BNO055's UART"),
+        ("--side", "Unix socket for what is done by hand: reset, pose, faults"),
+    ):
+        verb.add_argument(name, type=Path, required=True, metavar="PATH", help=told)
+    verb.add_argument(
+        "--speed",
+        type=number(0.0, 100.0, float),
+        default=1.0,
+        metavar="X",
+        help="of time; 0: it stands still but for a control period per write of goals; default: 1",
+    )
+    verb.add_argument(
+        "--period",
+        type=number(0.001, 1.0, float),
+        default=0.03,
+        metavar="S",
+        help="control period at --speed 0; default: %(default)s",
+    )
+    verb.add_argument(
+        "--protocol",
+        type=int,
+        choices=(1, 2),
+        default=1,
+        help="of the servos' firmware: Dynamixel 1.0 or 2.0; default: 1",
+    )

@@ -205,6 +205,18 @@ def _blind(options: argparse.Namespace) -> dict[str, Any]:
         return blind.ACTIONS[options.action](options)
 
 
+def _virtual_robot(options: argparse.Namespace) -> dict[str, Any]:
+    from services.virtual_robot import Wanted, serve
+
+    given = ("seed", "protocol", "speed", "period", "link", "imu", "side")
+    wanted = Wanted.of(**{name: getattr(options, name) for name in given})
+    return serve(RobotDescription.load(options.robot), wanted, _tell)
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
 def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
     from services.presysid import Options
 
@@ -287,6 +299,10 @@ def _show_diagnosis(shown: dict[str, Any]) -> None:
     diagnosis_table(shown)
 
 
+def _show_life(shown: dict[str, Any]) -> None:
+    print(f"{shown['robot']} lived for {shown['time']:.1f} s")
+
+
 def _show_recordings(shown: dict[str, Any]) -> None:
     for path in shown["recordings"]:
         print(path)
@@ -301,6 +317,7 @@ VERBS = {
     "replay": (_replay, _show_replay),
     "diagnose": (_diagnose, _show_diagnosis),
     "blind": (_blind, _show_blind),
+    "virtual-robot": (_virtual_robot, _show_life),
 }
 """What each verb does and how its outcome is shown."""
 
