@@ -173,6 +173,7 @@ class Maker:
             verdict="mismatch",
             findings=(self.finding(hypothesis, more, rest[0].hypothesis),),
             held_out=held_out(self.measured, before, after, 0),
+            before=before,
             model=after,
             rounds=(first,),
             found=traces,

@@ -47,7 +47,8 @@ class Diagnosis:
       nominal: the nominal fit.
       findings: what is missing, most important first.
       held_out: errors on motions left out, before and after.
-      model: the nominal model with what was found.
+      before: the nominal model with what it predicts of motions left out.
+      model: the same with what was found.
       rounds: how it came about.
       found: traces of all hypotheses.
       enough: surprise that chance does not reach.
@@ -73,6 +74,7 @@ class Diagnosis:
     enough: float
     regimes: tuple[Regime, ...]
     replays: int
+    before: Model | None = None
     ask: NextRecording | None = None
     missing: MissingInput | None = None
     unexplained: Unexplained | None = None
@@ -149,6 +151,7 @@ def diagnose(
         "enough": done.enough,
         "rounds": rounds,
         "held_out": held_out(measured, selector.nominal, final, seed),
+        "before": selector.nominal,
         "model": final,
         "unexplained": left,
     }

@@ -317,7 +317,7 @@ def _options(before: Fit, score: Score, fit: Fit) -> list[Array]:
     n, trace = len(before.at), score.trace.whole
     sizes = fit.at[n : n + trace.shape[1]]
     normal = before.jacobian.T @ before.jacobian
-    normal[np.diag_indices(n)] *= 1 + DAMPED
+    normal[np.diag_indices(n)] += 1 + DAMPED * np.diag(normal)
     low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
     options = []
     for share in SHARES:

@@ -154,8 +154,8 @@ def models(diagnosis: Diagnosis) -> dict[str, Model]:
     told: dict[str, Model] = {}
     if diagnosis.model is None:
         return told
-    if diagnosis.rounds:
-        told["nominal"] = diagnosis.rounds[0].before
+    if diagnosis.before is not None:
+        told["nominal"] = diagnosis.before
     told["corrected" if corrected(diagnosis) else "nominal"] = diagnosis.model
     return told
 
