@@ -36,6 +36,8 @@ AGREEMENT = 3e-3
 than noise: where much is missing, a fit has many ends that lack it all the same."""
 EXCESS = 0.03
 ABSOLUTE = 5.0
+SPARE = 0.02
+"""A fit that leaves no more than noise, and this share of it, has not stopped short."""
 ROUGH = 2e-3
 """Relative gain of chi-squared at which the starts may end: all that follows is the noise floor."""
 WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
@@ -168,6 +170,8 @@ def _agree(first: Fit, second: Fit) -> bool:
     assert first.residual is not None
     least, apart = min(first.chi2, second.chi2), abs(first.chi2 - second.chi2)
     excess = least - len(first.residual)
+    if excess <= SPARE * len(first.residual):
+        return True
     return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE)
 
 

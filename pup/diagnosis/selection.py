@@ -44,6 +44,8 @@ HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
+SWAPS, RIVALS = 2, 2
+"""Effects that may be exchanged, and rivals that each may be exchanged for."""
 MOST = 8
 """Effects that are looked for."""
 NOMINAL, TYPICAL = 0.2, 0.5
@@ -154,6 +156,17 @@ class Selector:
         """
         model = start
         rounds: list[Round] = []
+        for _ in range(SWAPS + 1):
+            model = self._added(model, rounds)
+            swap = self._swap(model, rounds)
+            if swap is None:
+                break
+            rounds.append(swap)
+            model = swap.finalists[0]
+        return self._without(model), rounds
+
+    def _added(self, model: Model, rounds: list[Round]) -> Model:
+        """The model with effects added as long as one holds; notes the rounds."""
         while len(model.hypotheses) < MOST:
             chosen = self._round(model)
             if chosen is None:
@@ -162,7 +175,36 @@ class Selector:
             if not chosen.accepted:
                 break
             model = chosen.finalists[0]
-        return self._without(model), rounds
+        return model
+
+    def _swap(self, model: Model, rounds: Sequence[Round]) -> Round | None:
+        """An effect exchanged for a rival of its own round, where what came later prefers that.
+
+        The first effects are chosen while others still hide; the last knows all of them.
+        """
+        owners, tried = [], []
+        for hypothesis in model.hypotheses[:-1]:
+            chosen = [r for r in rounds if r.accepted and r.chosen.key == hypothesis.key]
+            if not chosen:
+                continue
+            others = tuple(h for h in model.hypotheses if h is not hypothesis)
+            known = {h.key for h in model.hypotheses}
+            rivals = [m for m in chosen[-1].finalists[1:] if m.hypotheses[-1].key not in known]
+            for rival in rivals[:RIVALS]:
+                owners.append((chosen[-1], hypothesis, others))
+                fit = _joined(self._less(model, hypothesis), rival)
+                tried.append(((*others, rival.hypotheses[-1]), fit))
+        fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=ROUGH)
+        chi2 = [fit.chi2 for _, fit in tried]
+        if not chi2 or min(chi2) > model.fit.chi2 - self.enough:
+            return None
+        best = int(np.argmin(chi2))
+        (better,) = self.models([tried[best]])
+        if better.worth > model.worth - self.enough / 2:
+            return None
+        chosen_then, hypothesis, others = owners[best]
+        known_as = replace(model, hypotheses=(*others, hypothesis))
+        return replace(chosen_then, finalists=(better, known_as), holding=2)
 
     def model(self, hypotheses: Sequence[Hypothesis], fit: Fit) -> Model:
         """A fitted model with its predictions of the folds."""
@@ -327,6 +369,20 @@ def _options(before: Fit, score: Score, fit: Fit) -> list[Array]:
         step = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
         options += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
     return options
+
+
+def _joined(fit: Fit, rival: Model) -> Fit:
+    """A fit with the last effect of another model, as that found it."""
+    own = rival.hypotheses[-1]
+    names = {*own.magnitudes, *(name for name, _ in own.shape)}
+    kept = [i for i, c in enumerate(rival.fit.coordinates) if c.name in names]
+    return Fit(
+        fit.coordinates + tuple(rival.fit.coordinates[i] for i in kept),
+        np.r_[fit.at, rival.fit.at[kept]],
+        fixed={**fit.fixed, **{n: v for n, v in rival.fit.fixed.items() if n in names}},
+        thorough=False,
+        slack=ROUGHLY,
+    )
 
 
 def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
