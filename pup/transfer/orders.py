@@ -1,0 +1,60 @@
+"""What an operator may want of a study; each order given twice is one."""
+
+from dataclasses import replace
+
+from pup.transfer.study import HANDED_OUT, Study, StudyState, TrialError, TrialState
+
+
+def release(study: Study, number: int) -> Study:
+    """Let a trial pass the gate."""
+    return study.with_trial(study.trial(number).release())
+
+
+def retry(study: Study, number: int, attempt: int) -> Study:
+    """Run an aborted or lost trial again; a study that paused for it goes on."""
+    _not_done(study)
+    trial = study.trial(number)
+    if study.open and study.open != trial:
+        raise TrialError(f"trial {study.open.id} is under way; wait for it or cancel it first")
+    retried = trial.retry(attempt)
+    if retried == trial:
+        return study
+    return replace(study, state=StudyState.ACTIVE, reason="").with_trial(retried)
+
+
+def pause(study: Study, reason: str) -> Study:
+    """Make no more trials; the one under way ends as it may."""
+    _not_done(study)
+    return replace(study, state=StudyState.PAUSED, reason=reason)
+
+
+def resume(study: Study) -> Study:
+    """Make trials again."""
+    _not_done(study)
+    return replace(study, state=StudyState.ACTIVE, reason="")
+
+
+def cancel(study: Study, number: int, reason: str) -> Study:
+    """Take a trial back that nobody has; of one that an agent has, only make no more after it."""
+    trial = study.trial(number)
+    if trial.state is TrialState.REQUESTED:
+        study = study.with_trial(trial.withdraw(reason))
+    elif trial.state not in HANDED_OUT:
+        raise TrialError(f"trial {trial.id} is {trial.state}; it cannot be cancelled")
+    return pause(study, f"trial {number}: {reason}")
+
+
+def after_end(study: Study) -> Study:
+    """Pause a study whose trials keep giving no result."""
+    failed, active = study.failures(), study.state is StudyState.ACTIVE
+    if not active or failed < study.settings.failures:
+        return study
+    last = study.trials[-1]
+    why = last.result.reason if last.result else "nothing was heard of it"
+    told = f"trial {last.number} was {last.state} ({why}); retry it, or resume without it"
+    return replace(study, state=StudyState.PAUSED, reason=told)
+
+
+def _not_done(study: Study) -> None:
+    if study.state is StudyState.DONE:
+        raise TrialError(f"study {study.name} is done")

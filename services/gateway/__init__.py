@@ -1,0 +1,1 @@
+"""The gateway: studies over REST, robots over ZeroMQ, in one asyncio process."""

@@ -1,0 +1,333 @@
+"""The REST interface of CONTRACTS.md section 7, and what hangs together with it."""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import fields
+from functools import partial
+from importlib.metadata import version
+from typing import Annotated, Any
+
+from fastapi import APIRouter, FastAPI, HTTPException, Path, Query, Request
+from fastapi.responses import PlainTextResponse, Response, StreamingResponse
+from fastapi.staticfiles import StaticFiles
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+
+from pup.transfer import orders
+from pup.transfer.study import Study, StudySettings
+from services.gateway import pages, problems
+from services.gateway.access import BODY_LIMIT, IdempotencyKey, IdempotentRoute, needs
+from services.gateway.conductor import Conductor
+from services.gateway.keys import Role, Tokens, User
+from services.gateway.link import Link
+from services.gateway.problems import problem, responses
+from services.gateway.records import settings_of, study_document, trial_document
+from services.gateway.shapes import (
+    AgentList,
+    EventList,
+    NewStudy,
+    Posterior,
+    Reason,
+    Retry,
+    StudyList,
+    StudyShape,
+    TrialList,
+    TrialShape,
+)
+from services.gateway.store import Store
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$"
+STREAM = 15.0
+"""Between two signs of life of a stream of events, s."""
+
+StudyName = Annotated[str, Path(pattern=NAME, description="Name of a study.")]
+AgentName = Annotated[str, Path(pattern=NAME, description="Name of an agent.")]
+Number = Annotated[int, Path(ge=1, le=10**9, description="Of a trial in its study, from 1.")]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+After = Annotated[str, Query(max_length=64, description="The last name of the page before.")]
+Viewer = Annotated[User, needs(Role.VIEWER)]
+Operator = Annotated[User, needs(Role.OPERATOR)]
+
+READ = responses(401, 403, 404, 422)
+WRITE = responses(401, 403, 404, 409, 413, 422)
+v1 = APIRouter(prefix="/v1", route_class=IdempotentRoute)
+
+
+def application(store: Store, tokens: Tokens, conductor: Conductor, link: Link | None) -> FastAPI:
+    """The web application of a gateway.
+
+    Args:
+      store: of what must not be forgotten.
+      tokens: who may ask.
+      conductor: of the studies.
+      link: to the agents; None where only the interface is wanted.
+    """
+    app = FastAPI(
+        title="pup",
+        version=version("pup"),
+        description="Transfer of policies to robots: studies, trials, agents.",
+        docs_url=None,  # its page loads scripts from elsewhere
+        redoc_url=None,
+    )
+    app.state.store, app.state.tokens, app.state.locks = store, tokens, {}
+    app.state.conductor, app.state.link, app.state.stopping = conductor, link, False
+    app.include_router(v1)
+    app.include_router(_service())
+    app.include_router(pages.router)
+    app.mount("/static", StaticFiles(directory=pages.STATIC), name="static")
+    problems.handle(app)
+    app.middleware("http")(_guarded)
+    made = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        told = made()
+        schemas = told.setdefault("components", {}).setdefault("schemas", {})
+        schemas.setdefault("Problem", problems.Problem.model_json_schema())
+        return told
+
+    app.openapi = openapi  # type: ignore[method-assign]
+    return app
+
+
+async def _guarded(request: Request, handle: Callable[[Request], Awaitable[Response]]) -> Response:
+    """Refuses bodies that are too large, measures, and forbids browsers what pages do not need."""
+    began = time.perf_counter()
+    length = request.headers.get("Content-Length", "0" if request.method == "GET" else "")
+    if "transfer-encoding" in request.headers or (request.method == "POST" and not length):
+        response: Response = problem(411, "a Content-Length is needed", request)
+    elif length.isdecimal() and int(length) > BODY_LIMIT:
+        response = problem(413, f"more than {BODY_LIMIT} bytes", request)
+    else:
+        response = await handle(request)
+    metrics = request.app.state.conductor.metrics
+    spent = time.perf_counter() - began
+    metrics.requests.labels(request.method, response.status_code).observe(spent)
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    response.headers.setdefault("Cache-Control", "no-store")
+    response.headers["Content-Security-Policy"] = (
+        "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'self'"
+    )
+    return response
+
+
+def _conductor(request: Request) -> Conductor:
+    conductor: Conductor = request.app.state.conductor
+    return conductor
+
+
+def _json(value: Any, status: int = 200, **headers: str) -> Response:
+    body = json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+    return Response(body, status, headers, "application/json")
+
+
+@v1.get("/studies", response_model=StudyList, responses=READ)
+async def list_studies(
+    request: Request, _: Viewer, limit: Limit = 100, after: After = ""
+) -> Response:
+    """Studies by name, a page at a time."""
+    studies = _conductor(request).studies
+    names = sorted(name for name in studies if name > after)
+    told = [study_document(studies[name]) for name in names[:limit]]
+    return _json({"studies": told, "next": names[limit - 1] if len(names) > limit else None})
+
+
+@v1.post(
+    "/studies",
+    status_code=201,
+    response_model=StudyShape,
+    responses=WRITE | {200: {"description": "There is one like it: joined.", "model": StudyShape}},
+)
+async def create_study(
+    request: Request, user: Operator, wanted: NewStudy, key: IdempotencyKey = None
+) -> Response:
+    """Make a study, or join one of the same name and settings."""
+    known = {f.name for f in fields(StudySettings)}
+    told = {k: v for k, v in wanted.model_dump(mode="json").items() if k in known}
+    settings = settings_of(told)
+    simulated = wanted.simulated.checked(len(settings.lower)) if wanted.simulated else None
+    study, new = await _conductor(request).create(wanted.name, settings, simulated, user.name)
+    place = f"/v1/studies/{study.name}"
+    return _json(study_document(study), 201 if new else 200, Location=place)
+
+
+@v1.get("/studies/{study}", response_model=StudyShape, responses=READ)
+async def get_study(request: Request, _: Viewer, study: StudyName) -> Response:
+    """One study."""
+    conductor = _conductor(request)
+    found = conductor.study(study)
+    return _json(study_document(found) | {"waits_for": conductor.waits_for(found)})
+
+
+@v1.get("/studies/{study}/trials", response_model=TrialList, responses=READ)
+async def list_trials(
+    request: Request,
+    _: Viewer,
+    study: StudyName,
+    limit: Limit = 1000,
+    after: Annotated[int, Query(ge=0, le=10**9)] = 0,
+) -> Response:
+    """Trials of a study by number."""
+    trials = _conductor(request).study(study).trials[after:]
+    told = [trial_document(t) for t in trials[:limit]]
+    return _json({"trials": told, "next": after + limit if len(trials) > limit else None})
+
+
+@v1.get("/studies/{study}/posterior", response_model=Posterior, responses=READ)
+async def get_posterior(request: Request, _: Viewer, study: StudyName) -> Response:
+    """The Gaussian process: what would be chosen now, and slices through it."""
+    return _json(await _conductor(request).posterior(study))
+
+
+@v1.get("/studies/{study}/history", response_model=EventList, responses=READ)
+async def list_events(
+    request: Request,
+    _: Viewer,
+    study: StudyName,
+    limit: Limit = 1000,
+    after: Annotated[int, Query(ge=0, le=2**53)] = 0,
+) -> Response:
+    """What happened and why: decisions with their reasons, reports, orders."""
+    _conductor(request).study(study)
+    store: Store = request.app.state.store
+    told = await store.events(study, after, limit)
+    return _json({"events": told, "next": told[-1]["id"] if len(told) == limit else None})
+
+
+@v1.get(
+    "/studies/{study}/events",
+    responses=READ | {200: {"content": {"text/event-stream": {}}}},
+    response_class=StreamingResponse,
+)
+async def stream_study(request: Request, _: Viewer, study: StudyName) -> Response:
+    """Server-sent events: one whenever the study changed, with its revision."""
+    _conductor(request).study(study)
+    return _stream(request, study)
+
+
+@v1.post("/studies/{study}:pause", response_model=StudyShape, responses=WRITE)
+async def pause_study(
+    request: Request, user: Operator, study: StudyName, why: Reason, key: IdempotencyKey = None
+) -> Response:
+    """Make no more trials; the one under way ends as it may."""
+    order = partial(orders.pause, reason=f"{user.name}: {why.reason}")
+    return _json(
+        study_document(await _conductor(request).change(study, user.name, order, "paused"))
+    )
+
+
+@v1.post("/studies/{study}:resume", response_model=StudyShape, responses=WRITE)
+async def resume_study(
+    request: Request, user: Operator, study: StudyName, key: IdempotencyKey = None
+) -> Response:
+    """Make trials again."""
+    conductor = _conductor(request)
+    told = await conductor.change(study, user.name, orders.resume, "resumed")
+    return _json(study_document(told))
+
+
+@v1.post("/studies/{study}/trials/{number}:release", response_model=TrialShape, responses=WRITE)
+async def release_trial(
+    request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
+) -> Response:
+    """Let a trial go to the robot."""
+    order = partial(orders.release, number=number)
+    told = await _conductor(request).change(study, user.name, order, "released")
+    return _trial(told, number)
+
+
+@v1.post("/studies/{study}/trials/{number}:retry", response_model=TrialShape, responses=WRITE)
+async def retry_trial(
+    request: Request,
+    user: Operator,
+    study: StudyName,
+    number: Number,
+    wanted: Retry,
+    key: IdempotencyKey = None,
+) -> Response:
+    """Run an aborted or lost trial again; `attempt` is the number of the new attempt."""
+    order = partial(orders.retry, number=number, attempt=wanted.attempt)
+    told = await _conductor(request).change(study, user.name, order, "retried")
+    return _trial(told, number)
+
+
+@v1.post("/studies/{study}/trials/{number}:cancel", response_model=TrialShape, responses=WRITE)
+async def cancel_trial(
+    request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
+) -> Response:
+    """Take a trial back, or ask its agent to stop it; the study pauses."""
+    return _trial(await _conductor(request).cancel(study, number, user.name), number)
+
+
+def _trial(study: Study, number: int) -> Response:
+    return _json(trial_document(study.trial(number)))
+
+
+@v1.get("/agents", response_model=AgentList, responses=responses(401, 403))
+async def list_agents(request: Request, _: Viewer) -> Response:
+    """Agents that are let in, and how they are."""
+    agents = _conductor(request).agents
+    return _json({"agents": [agents[name].document() for name in sorted(agents)]})
+
+
+@v1.get(
+    "/agents/-/events",
+    responses=READ | {200: {"content": {"text/event-stream": {}}}},
+    response_class=StreamingResponse,
+)
+async def stream_agents(request: Request, _: Viewer) -> Response:
+    """Server-sent events: one whenever an agent was heard, at most one a second."""
+    return _stream(request, "")
+
+
+@v1.post("/agents/{agent}:stop", status_code=202, responses=WRITE)
+async def stop_agent(
+    request: Request, user: Operator, agent: AgentName, why: Reason, key: IdempotencyKey = None
+) -> Response:
+    """Emergency stop by message; the switch at the robot is faster."""
+    await _conductor(request).stop(agent, user.name, why.reason)
+    return _json({"stopped": agent}, 202)
+
+
+def _stream(request: Request, name: str) -> Response:
+    conductor = _conductor(request)
+
+    async def told() -> AsyncIterator[str]:
+        revision = conductor.revision[name]
+        yield f"retry: 2000\ndata: {revision}\n\n"
+        while not await request.is_disconnected() and not request.app.state.stopping:
+            now = await conductor.wait(name, revision, STREAM)
+            yield f"data: {now}\n\n" if now != revision else ": still here\n\n"
+            revision = now
+            await asyncio.sleep(0.5)  # a browser need not know sooner
+
+    return StreamingResponse(told(), media_type="text/event-stream")
+
+
+def _service() -> APIRouter:
+    router = APIRouter(tags=["service"])
+
+    @router.get("/healthz", response_class=PlainTextResponse)
+    async def healthz() -> str:
+        """Whether the process runs."""
+        return "ok\n"
+
+    @router.get("/readyz", response_class=PlainTextResponse, responses=responses(503))
+    async def readyz(request: Request) -> str:
+        """Whether agents can connect and the database takes writes."""
+        link: Link | None = request.app.state.link
+        if link is not None and not link.bound:
+            raise HTTPException(503, "the link is not bound")
+        if not await request.app.state.store.writable():
+            raise HTTPException(503, "the database takes no writes")
+        return "ready\n"
+
+    @router.get("/metrics", response_class=PlainTextResponse, responses=responses(401, 403))
+    async def metrics(request: Request, _: Viewer) -> Response:
+        """For Prometheus."""
+        conductor = _conductor(request)
+        conductor.measure()
+        return Response(generate_latest(conductor.metrics.registry), 200, {}, CONTENT_TYPE_LATEST)
+
+    return router

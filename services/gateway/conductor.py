@@ -1,0 +1,416 @@
+"""Lets studies go on: suggests trials, hands them out, hears how they end.
+
+What keeps a walk from being lost, made twice or told twice: a change is computed by
+`pup.transfer.study`, written to the store, and only then kept in memory, sent or acknowledged. A
+gateway that dies between any two of these finds in the store what it had decided and goes on from
+there: it sends the same assignment with the same fence again, and the agent sends its result again
+until it is acknowledged.
+"""
+
+import asyncio
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any, Protocol
+
+from pup.transfer import orders
+from pup.transfer.study import (
+    HANDED_OUT,
+    Choose,
+    Finish,
+    Gate,
+    Purpose,
+    Result,
+    Study,
+    StudySettings,
+    StudyState,
+    Suggest,
+    Ticket,
+    Trial,
+    TrialError,
+    TrialState,
+    Verdict,
+    Wait,
+    Walk,
+    next_step,
+)
+from pup.wire import Accepted, Armed, Assign, Body, Cancel, Finished, Running, Stop
+from services.gateway import fits
+from services.gateway.agents import AgentView
+from services.gateway.metrics import Metrics
+from services.gateway.records import Row
+from services.gateway.store import Change, Event, ReplacedError, Store
+
+log = logging.getLogger(__name__)
+
+PERIOD = 0.5
+"""Between two looks at leases, idle agents and unanswered assignments, s."""
+RESEND = 2.0
+"""Without an answer to an assignment until it is sent again, s."""
+
+
+REPORTED = {
+    Accepted: TrialState.ASSIGNED,
+    Armed: TrialState.ARMED,
+    Running: TrialState.RUNNING,
+}
+
+
+class UnknownError(TrialError):
+    """There is no such study or agent."""
+
+
+class Send(Protocol):
+    """Sends a message to an agent, if it is connected."""
+
+    def __call__(self, agent: str, body: Body) -> None:
+        """Send it; nothing happens where it is away."""
+        ...
+
+
+class Conductor:
+    """The studies of one gateway.
+
+    Args:
+      store: what must not be forgotten.
+      fitted: runs the Gaussian processes.
+      metrics: counts.
+    """
+
+    def __init__(self, store: Store, fitted: fits.Fits, metrics: Metrics) -> None:
+        self.store, self.fits, self.metrics = store, fitted, metrics
+        self.studies: dict[str, Study] = {}
+        self.simulated: dict[str, Row | None] = {}
+        self.agents: dict[str, AgentView] = {}
+        self.revision: dict[str, int] = defaultdict(int)
+        self.send: Send = lambda agent, body: None
+        self.stopped: BaseException | None = None
+        self._locks: dict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._heard: dict[str, float] = {}
+        self._sent: dict[str, float] = {}
+        self._posteriors: dict[str, tuple[str, Row]] = {}
+        self._changed: dict[str, asyncio.Event] = defaultdict(asyncio.Event)
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._wanted: set[str] = set()
+        self._handing_out = asyncio.Lock()
+
+    async def load(self) -> None:
+        """Read the store; trials that were handed out get a whole lease anew."""
+        for study, simulated in await self.store.studies():
+            self.studies[study.name], self.simulated[study.name] = study, simulated
+            self._heard[study.name] = time.monotonic()
+
+    async def run(self) -> None:
+        """Go on until the process ends, or another gateway takes over."""
+        while True:
+            self.tick()
+            await asyncio.sleep(PERIOD)
+
+    def tick(self) -> None:
+        """Look once at all studies."""
+        for name in list(self.studies):
+            if self.studies[name].state is not StudyState.DONE:
+                self._go_on(name)
+
+    def study(self, name: str) -> Study:
+        """A study by its name.
+
+        Raises:
+          UnknownError: there is none.
+        """
+        if name not in self.studies:
+            raise UnknownError(f"there is no study {name}")
+        return self.studies[name]
+
+    async def create(
+        self, name: str, settings: StudySettings, simulated: Row | None, who: str
+    ) -> tuple[Study, bool]:
+        """Make a study; one of the same name and settings is joined.
+
+        Returns:
+          The study, and whether it is new.
+
+        Raises:
+          TrialError: there is one of this name with other settings.
+        """
+        async with self._locks[name]:
+            if name in self.studies:
+                if self.studies[name].settings != settings:
+                    raise TrialError(f"study {name} exists with other settings; use another name")
+                return self.studies[name], False
+            event = Event("created", who, detail={"settings": asdict(settings)})
+            self._heard[name] = time.monotonic()
+            self.simulated[name] = simulated
+            study = Study(name, settings)
+            await self._write(Change(study, events=[event], simulated=simulated))
+        self._go_on(name)
+        return study, True
+
+    async def change(self, name: str, who: str, act: Callable[[Study], Study], kind: str) -> Study:
+        """Do what an operator wants with a study."""
+        async with self._locks[name]:
+            before = self.study(name)
+            study = act(before)
+            if study != before:
+                trials = [t for t in study.trials if t not in before.trials]
+                number = trials[0].number if trials else None
+                await self._write(Change(study, trials, [Event(kind, who, number)]))
+        self._go_on(name)
+        return study
+
+    async def cancel(self, name: str, number: int, who: str) -> Study:
+        """Take a trial back, or ask its agent to stop it; the study pauses."""
+        reason = f"cancelled by {who}"
+        order = partial(orders.cancel, number=number, reason=reason)
+        study = await self.change(name, who, order, "cancelled")
+        trial = study.trial(number)
+        if trial.state in HANDED_OUT and trial.agent:
+            self.send(trial.agent, Cancel(trial.id, trial.attempt, trial.fence))
+        return study
+
+    async def stop(self, agent: str, who: str, reason: str) -> None:
+        """Stop a robot, now; then pause what it was at."""
+        if agent not in self.agents:
+            raise UnknownError(f"there is no agent {agent}")
+        self.send(agent, Stop(f"{who}: {reason}"))
+        at = [s for s in self.studies.values() if s.open and s.open.agent == agent]
+        await self.store.log([Event("stopped", who, detail={"agent": agent, "reason": reason})])
+        for study in at:
+            told = f"{agent} was stopped by {who}: {reason}"
+            await self.change(study.name, who, partial(orders.pause, reason=told), "paused")
+
+    def heard(self, agent: str, trial: str | None) -> None:
+        """A sign of life: it renews the lease of the trial that it names."""
+        study = self.studies.get((trial or "").rpartition("/")[0])
+        if study and study.open and study.open.id == trial and study.open.agent == agent:
+            self._heard[study.name] = time.monotonic()
+
+    async def reported(self, agent: str, body: Accepted | Armed | Running) -> Verdict:
+        """An agent took a trial on, or its robot moves."""
+        where = self._place(body.trial)
+        if where is None:
+            return Verdict.UNKNOWN
+        name, number = where
+        ticket = Ticket(body.attempt, body.fence, agent)
+        self.agents[agent].journal.add((body.trial, body.attempt, body.fence))
+        async with self._locks[name]:
+            study = self.studies[name]
+            trial, verdict = study.trial(number).report(ticket, REPORTED[type(body)])
+            if verdict is Verdict.COUNTED:
+                event = Event(trial.state.value, agent, number, asdict(body))
+                await self._write(Change(study.with_trial(trial), [trial], [event]))
+        if verdict in (Verdict.LATE, Verdict.UNKNOWN) and not isinstance(body, Running):
+            self.send(agent, Cancel(body.trial, body.attempt, body.fence))
+        return verdict
+
+    async def finished(self, agent: str, body: Finished) -> Verdict:
+        """A trial ended; once this returns, it is stored and may be acknowledged."""
+        where = self._place(body.trial)
+        if where is None:
+            event = Event("unknown", agent, detail=asdict(body))
+            await self.store.log([event])
+            return Verdict.UNKNOWN
+        name, number = where
+        result = Result(
+            TrialState(body.state.value),
+            body.distance,
+            body.time,
+            body.reason,
+            body.recording,
+            body.digest,
+        )
+        async with self._locks[name]:
+            study = self.studies[name]
+            before = study.trial(number)
+            trial, verdict = before.finish(Ticket(body.attempt, body.fence, agent), result)
+            if verdict is Verdict.COUNTED:
+                event = Event(trial.state.value, agent, number, asdict(body))
+                study = orders.after_end(study.with_trial(trial))
+                await self._write(Change(study, [trial], [event]))
+                self.metrics.trials.labels(trial.state.value).inc()
+            elif verdict is not Verdict.REPEATED:
+                await self.store.log([Event(verdict.value, agent, number, asdict(body))], name)
+                self.metrics.trials.labels(verdict.value).inc()
+        self._go_on(name)
+        return verdict
+
+    async def posterior(self, name: str) -> Row:
+        """The Gaussian process of a study; computed once for the same walks."""
+        study = self.study(name)
+        key = f"{len(study.told)}/{[(t.number, t.attempt) for t in study.told]}"
+        kept = self._posteriors.get(name)
+        if kept is None or kept[0] != key:
+            made = await self.fits.run(fits.posterior, study, self.simulated[name])
+            kept = self._posteriors[name] = (key, made)
+        return kept[1]
+
+    async def wait(self, name: str, revision: int, seconds: float) -> int:
+        """Wait until a study, or with an empty name an agent, changed since a revision."""
+        if self.revision[name] == revision:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._changed[name].wait(), seconds)
+        return self.revision[name]
+
+    def notify(self, name: str) -> None:
+        """Tell whoever waits that something changed."""
+        self.revision[name] += 1
+        self._changed.pop(name, asyncio.Event()).set()
+
+    def waits_for(self, study: Study) -> str:
+        """What the open trial of a study waits for, in words."""
+        trial = study.open
+        if trial is None or trial.state is not TrialState.REQUESTED:
+            return ""
+        if not trial.released:
+            return "an operator to release it"
+        unfit = self._unfit(study)
+        fit = [name for name, why in unfit.items() if why is None]
+        told = "; ".join(f"{name} {why}" for name, why in unfit.items())
+        return "" if fit else f"an agent: {told or 'none is known'}"
+
+    def measure(self) -> None:
+        """Bring the gauges up to date."""
+        states = [s.state for s in self.studies.values()]
+        for state in StudyState:
+            self.metrics.studies.labels(state.value).set(states.count(state))
+        for view in self.agents.values():
+            self.metrics.agent(view)
+
+    def _place(self, trial: str) -> tuple[str, int] | None:
+        name, _, number = trial.rpartition("/")
+        study = self.studies.get(name)
+        if study is None or not number.isascii() or not number.isdecimal() or len(number) > 9:
+            return None
+        return (name, int(number)) if 1 <= int(number) <= len(study.trials) else None
+
+    def _unfit(self, study: Study) -> dict[str, str | None]:
+        """Why each agent that may take a study's trial cannot; None where it can."""
+        trials = (s.open for s in self.studies.values())
+        busy = {t.agent: t.id for t in trials if t and t.state in HANDED_OUT}
+        settings, wanted = study.settings, study.settings.agent
+        told: dict[str, str | None] = {}
+        for name in [wanted] if wanted else sorted(self.agents):
+            view = self.agents.get(name)
+            if view is None:
+                told[name] = "is not connected"
+            elif name in busy:
+                told[name] = f"is at {busy[name]}"
+            else:
+                told[name] = view.can_run(settings.robot, settings.policy)
+        return told
+
+    async def _write(self, change: Change) -> None:
+        """Store a change, then make it known."""
+        try:
+            await self.store.write(change)
+        except ReplacedError as error:
+            self.stopped = error
+            raise
+        self.studies[change.study.name] = change.study
+        self.notify(change.study.name)
+
+    def _go_on(self, name: str) -> None:
+        """Look at a study without waiting for it; again, where a look is under way."""
+        self._wanted.add(name)
+        if name not in self._tasks:
+            task = asyncio.get_running_loop().create_task(self._looks(name))
+            self._tasks[name] = task
+            task.add_done_callback(lambda done: self._looked(name, done))
+
+    async def _looks(self, name: str) -> None:
+        while name in self._wanted:
+            self._wanted.discard(name)
+            await self._look(name)
+
+    def _looked(self, name: str, done: "asyncio.Task[None]") -> None:
+        self._tasks.pop(name, None)
+        if not done.cancelled() and (error := done.exception()):
+            log.error("study failed", extra={"study": name}, exc_info=error)
+        elif name in self._wanted and not done.cancelled():
+            self._go_on(name)
+
+    async def _look(self, name: str) -> None:
+        """Do what a study needs: end a lease, hand out, suggest, choose."""
+        async with self._locks[name]:
+            study = self.studies[name]
+            trial = study.open
+            if trial and trial.state in HANDED_OUT:
+                await self._watch(study, trial)
+            elif trial and trial.released:
+                async with self._handing_out:
+                    await self._hand_out(study, trial)
+            elif not isinstance(step := next_step(study), Wait):
+                await self._step(study, step)
+                self._wanted.add(name)
+
+    async def _watch(self, study: Study, trial: Trial) -> None:
+        now = time.monotonic()
+        if now - self._heard[study.name] > study.settings.lease:
+            lost = trial.expire()
+            event = Event("lost", trial=trial.number, detail={"agent": trial.agent})
+            study = orders.after_end(study.with_trial(lost))
+            await self._write(Change(study, [lost], [event]))
+            self.metrics.trials.labels("lost").inc()
+        elif trial.state is TrialState.ASSIGNED and now - self._sent.get(trial.id, 0.0) > RESEND:
+            self._assign(study, trial)
+
+    async def _hand_out(self, study: Study, trial: Trial) -> None:
+        agent = next((n for n, why in self._unfit(study).items() if why is None), None)
+        if agent is None:
+            return
+        given = trial.assign(agent, study.fence + 1)
+        study = replace(study, fence=given.fence).with_trial(given)
+        self._heard[study.name] = time.monotonic()
+        event = Event("assigned", trial=given.number, detail={"agent": agent, "fence": given.fence})
+        await self._write(Change(study, [given], [event]))
+        self._assign(study, given)
+
+    def _assign(self, study: Study, trial: Trial) -> None:
+        """Tell an agent to run a trial, unless its journal says that it knows."""
+        view = self.agents.get(trial.agent or "")
+        if view is None or (trial.id, trial.attempt, trial.fence) in view.journal:
+            return
+        same = (t for t in study.told if t.eta == trial.eta and t.result and t.result.recording)
+        first = next(same, None)
+        repeat_of = first.result.recording if first and first.result else None
+        self._sent[trial.id] = time.monotonic()
+        settings = study.settings
+        self.send(
+            view.name,
+            Assign(
+                study.name,
+                trial.id,
+                trial.attempt,
+                trial.fence,
+                settings.policy,
+                trial.eta,
+                settings.horizon,
+                repeat_of,
+            ),
+        )
+
+    async def _step(self, study: Study, step: Any) -> None:
+        match step:
+            case Suggest():
+                with self.metrics.suggest.time():
+                    decision = await self.fits.run(fits.suggest, study, self.simulated[study.name])
+                await self._add(study, decision.eta, decision.purpose, asdict(decision))
+            case Walk(eta, purpose):
+                await self._add(study, eta, purpose, {"eta": list(eta), "purpose": purpose.value})
+            case Choose():
+                decision = await self.fits.run(fits.choose, study, self.simulated[study.name])
+                study = replace(study, chosen=decision.eta)
+                await self._write(Change(study, events=[Event("chosen", detail=asdict(decision))]))
+            case Finish():
+                study = replace(study, state=StudyState.DONE)
+                await self._write(Change(study, events=[Event("done")]))
+
+    async def _add(self, study: Study, eta: Any, purpose: Purpose, why: Row) -> None:
+        released = study.settings.gate is Gate.AUTO
+        trial = Trial(study.name, len(study.trials) + 1, tuple(eta), purpose, released=released)
+        event = Event("requested", trial=trial.number, detail=why)
+        await self._write(Change(study.with_trial(trial), [trial], [event]))

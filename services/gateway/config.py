@@ -1,0 +1,97 @@
+"""How a gateway is set up: a TOML file, and environment variables that win over it."""
+
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+
+PREFIX = "PUP_"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Where a gateway listens and keeps things.
+
+    Attributes:
+      data: folder for the database, tokens, keys and recordings.
+      host: that REST and pages are served at; loopback unless told otherwise.
+      port: likewise.
+      link: ZeroMQ address for agents.
+      database: URL of SQLAlchemy; empty for SQLite in `data`.
+      certificate: file with the certificate of TLS; empty for none.
+      key: file with its secret key.
+      log: least level that is logged, `debug`, `info`, `warning` or `error`.
+    """
+
+    data: Path = Path("pup-service")
+    host: str = "127.0.0.1"
+    port: int = 8470
+    link: str = "tcp://127.0.0.1:8471"
+    database: str = ""
+    certificate: str = ""
+    key: str = ""
+    log: str = "info"
+
+    @classmethod
+    def read(cls, file: Path | None, environment: Mapping[str, str] = os.environ) -> "Config":
+        """Read the file, if there is one, then the variables `PUP_<ATTRIBUTE>`.
+
+        Raises:
+          InputError: a key is unknown or a value cannot be.
+        """
+        told: dict[str, Any] = {}
+        if file is not None:
+            try:
+                told = tomllib.loads(file.read_text(encoding="utf-8"))
+            except OSError as error:
+                raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+            except ValueError as error:
+                raise InputError(f"{file}: not TOML ({error})") from error
+        names = {f.name for f in fields(cls)}
+        if unknown := sorted(set(told) - names):
+            known = ", ".join(sorted(names))
+            raise InputError(f"{file}: {unknown[0]} is unknown; there are {known}")
+        for name in names & {n.removeprefix(PREFIX).lower() for n in environment}:
+            if PREFIX + name.upper() in environment:
+                told[name] = environment[PREFIX + name.upper()]
+        return cls()._with(told, file)
+
+    @property
+    def url(self) -> str:
+        """Of the database."""
+        return self.database or f"sqlite:///{(self.data / 'gateway.db').absolute()}"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether REST and pages are for this computer alone."""
+        return self.host in ("127.0.0.1", "::1", "localhost")
+
+    def _with(self, told: Mapping[str, Any], file: Path | None) -> "Config":
+        read: dict[str, Any] = {}
+        for name, value in told.items():
+            if name == "port":
+                try:
+                    read[name] = int(value)
+                except (TypeError, ValueError):
+                    read[name] = -1
+                if isinstance(value, bool) or not 0 <= read[name] < 2**16:
+                    raise InputError(f"port: {str(value)[:40]!r} is none; use 0 to 65535")
+            elif not isinstance(value, str):
+                raise InputError(f"{name}: {str(value)[:40]!r} is no text")
+            else:
+                read[name] = value
+        if "data" in read:
+            base = file.parent if file and PREFIX + "DATA" not in os.environ else Path()
+            read["data"] = base / Path(read["data"]).expanduser()
+        config = replace(self, **read)
+        if not config.link.startswith("tcp://"):
+            raise InputError(f"link: {config.link[:40]!r} is no address such as {Config.link}")
+        if config.log not in ("debug", "info", "warning", "error"):
+            raise InputError(f"log: {config.log[:40]!r}; use debug, info, warning or error")
+        if bool(config.certificate) != bool(config.key):
+            raise InputError("certificate and key belong together; give both or none")
+        return config

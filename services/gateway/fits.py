@@ -1,0 +1,117 @@
+"""Gaussian processes in a process of their own, so that heartbeats flow during a fit."""
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from pup.transfer.study import Study
+from services.gateway.records import Row
+
+P = ParamSpec("P")
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+
+class Fits:
+    """Runs functions of `pup.transfer.optimizer` one after the other in a child process."""
+
+    def __init__(self) -> None:
+        self._pool = self._made()
+
+    def _made(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_one_thread)
+
+    async def run(self, act: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
+        """Run a function of a module; once more where the process was killed meanwhile."""
+        for last in (False, True):
+            pool = self._pool
+            try:
+                return await asyncio.wrap_future(pool.submit(act, *args, **options))
+            except BrokenProcessPool:
+                log.warning("the process of the fits ended; another one is started")
+                if self._pool is pool:
+                    self._pool = self._made()
+                if last:
+                    raise
+        raise AssertionError
+
+    def close(self) -> None:
+        """End the process, whatever it is at."""
+        children = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for child in children:
+            child.terminate()
+
+
+def _one_thread() -> None:
+    """Threads of their own for such small matrices only take cores from others."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    import signal
+    import warnings
+
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the gateway ends it
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+
+
+def search_of(study: Study, simulated: Row | None) -> Any:
+    """What the optimiser gets to know of a study: all its walks, in the order of their numbers."""
+    from pup.transfer.optimizer import Search
+    from pup.transfer.surrogate import Simulated
+
+    settings = study.settings
+    told = study.told
+    eta = np.array([t.eta for t in told], dtype=float).reshape(-1, len(settings.lower))
+    distance = np.array([_distance(t.result) for t in told], dtype=float)
+    used = simulated if settings.warm_start else None
+    return Search(
+        settings.lower,
+        settings.upper,
+        settings.initial,
+        settings.seed,
+        eta,
+        distance,
+        used and Simulated(np.array(used["eta"], float), np.array(used["distance"], float)),
+    )
+
+
+def _distance(result: Any) -> float:
+    """What the process is told: an infeasible eta went nowhere."""
+    return result.distance if result.state == "succeeded" else 0.0
+
+
+def suggest(study: Study, simulated: Row | None) -> Any:
+    """The decision on the next trial's eta."""
+    from pup.transfer import optimizer
+
+    return optimizer.suggest(search_of(study, simulated), len(study.trials) + 1)
+
+
+def choose(study: Study, simulated: Row | None) -> Any:
+    """The decision on the eta to keep."""
+    from pup.transfer import optimizer
+
+    return optimizer.choose(search_of(study, simulated))
+
+
+def posterior(study: Study, simulated: Row | None) -> Row:
+    """The process as the REST interface tells it: what would be chosen, and slices through it."""
+    from dataclasses import asdict
+
+    from pup.transfer import optimizer
+
+    search = search_of(study, simulated)
+    if len(search.distance) < 2:
+        return {"walks": len(search.distance), "best": None, "slices": []}
+    best = asdict(optimizer.choose(search))
+    drawn = [asdict(s) for s in optimizer.slices(search)]
+    return {"walks": len(search.distance), "best": best, "slices": drawn}

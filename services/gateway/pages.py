@@ -1,0 +1,129 @@
+"""The pages: studies, one study as it goes on, agents. No script or style from elsewhere."""
+
+from pathlib import Path
+from typing import Annotated, Any
+from urllib.parse import parse_qs
+
+from fastapi import APIRouter, Request
+from fastapi import Path as InPath
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from jinja2 import Environment, PackageLoader, select_autoescape
+from markupsafe import Markup
+
+from services.gateway import drawing
+from services.gateway.access import COOKIE, asking
+from services.gateway.conductor import Conductor
+from services.gateway.keys import Role, Tokens, User
+from services.gateway.records import study_document, trial_document
+
+STATIC = Path(__file__).parent / "static"
+YEAR = 365 * 86400
+FORM_LIMIT = 1024
+"""Of a form, bytes."""
+SHOWN = 60
+"""Numbers of an agent's health on its card."""
+
+router = APIRouter(include_in_schema=False)
+_templates = Environment(
+    loader=PackageLoader("services.gateway"),
+    autoescape=select_autoescape(),
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+Name = Annotated[str, InPath(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")]
+
+
+def _page(
+    name: str, request: Request, user: User | None, status: int = 200, **told: Any
+) -> Response:
+    may = user is not None and user.role >= Role.OPERATOR
+    text = _templates.get_template(name).render(user=user, may=may, path=request.url.path, **told)
+    return HTMLResponse(text, status)
+
+
+def _login(request: Request) -> Response:
+    return RedirectResponse("/login", 303)
+
+
+@router.get("/login")
+async def login(request: Request) -> Response:
+    """Asks for a token."""
+    return _page("login.html", request, None, wrong=False)
+
+
+@router.post("/login")
+async def enter(request: Request) -> Response:
+    """Keeps the token as a cookie that scripts cannot read and other sites cannot send."""
+    form = parse_qs((await request.body())[:FORM_LIMIT].decode(errors="replace"))
+    token = form.get("token", [""])[0].strip()
+    tokens: Tokens = request.app.state.tokens
+    if tokens.user(token) is None:
+        return _page("login.html", request, None, 401, wrong=True)
+    response = RedirectResponse("/", 303)
+    secure = request.url.scheme == "https"
+    response.set_cookie(COOKIE, token, YEAR, httponly=True, samesite="strict", secure=secure)
+    return response
+
+
+@router.post("/logout")
+async def leave() -> Response:
+    """Forgets the token."""
+    response = RedirectResponse("/login", 303)
+    response.delete_cookie(COOKIE)
+    return response
+
+
+@router.get("/")
+async def studies(request: Request) -> Response:
+    """All studies."""
+    if (user := asking(request)) is None:
+        return _login(request)
+    conductor: Conductor = request.app.state.conductor
+    told = [
+        study_document(study) | {"waits_for": conductor.waits_for(study)}
+        for study in reversed(conductor.studies.values())
+    ]
+    return _page("studies.html", request, user, studies=told)
+
+
+@router.get("/studies/{study}")
+@router.get("/studies/{study}/live")
+async def one(request: Request, study: Name) -> Response:
+    """A study; `live` is the part that changes."""
+    if (user := asking(request)) is None:
+        return _login(request)
+    conductor: Conductor = request.app.state.conductor
+    found = conductor.study(study)
+    posterior = await conductor.posterior(study)
+    trial, sample = found.open, None
+    view = conductor.agents.get(trial.agent or "") if trial else None
+    if view and trial and view.sample and view.sample.trial == trial.id:
+        sample = view.sample
+    best = posterior["best"]
+    name = "study_live.html" if request.url.path.endswith("/live") else "study.html"
+    return _page(
+        name,
+        request,
+        user,
+        study=study_document(found) | {"waits_for": conductor.waits_for(found)},
+        trials=[trial_document(t) for t in reversed(found.trials)],
+        trial=trial and trial_document(trial),
+        sample=sample,
+        best=best,
+        progress=Markup(drawing.progress(found)),
+        slices=[Markup(s) for s in drawing.slices(posterior, found)] if best else [],
+    )
+
+
+@router.get("/agents")
+@router.get("/agents/live")
+async def agents(request: Request) -> Response:
+    """The agents and how they are; `live` is the part that changes."""
+    if (user := asking(request)) is None:
+        return _login(request)
+    conductor: Conductor = request.app.state.conductor
+    told = [conductor.agents[name].document() for name in sorted(conductor.agents)]
+    for agent in told:
+        agent["health"] = list(agent["health"].items())[:SHOWN]
+    name = "agents_live.html" if request.url.path.endswith("/live") else "agents.html"
+    return _page(name, request, user, agents=told)

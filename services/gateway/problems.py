@@ -1,0 +1,80 @@
+"""Errors as problem documents (RFC 9457)."""
+
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+
+from pup.errors import InputError
+from pup.transfer.study import TrialError
+from services.gateway.conductor import UnknownError
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(BaseModel):
+    """What went wrong, as RFC 9457 has it."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = ""
+    instance: str = ""
+
+
+def problem(status: int, detail: str, request: Request, **headers: str) -> JSONResponse:
+    """A problem as a response."""
+    told = Problem(
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        instance=request.url.path,
+    )
+    return JSONResponse(told.model_dump(), status, headers, media_type=MEDIA_TYPE)
+
+
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """For OpenAPI: that these may come, as problems."""
+    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
+    return {
+        status: {"description": HTTPStatus(status).phrase, "content": {MEDIA_TYPE: schema}}
+        for status in statuses
+    }
+
+
+def handle(app: FastAPI) -> None:
+    """Let an application tell its errors so."""
+
+    @app.exception_handler(HTTPException)
+    async def of_http(request: Request, error: HTTPException) -> JSONResponse:
+        return problem(error.status_code, str(error.detail), request, **(error.headers or {}))
+
+    @app.exception_handler(RequestValidationError)
+    async def of_validation(request: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        return problem(422, f"{place}: {first['msg']}", request)
+
+    @app.exception_handler(UnknownError)
+    async def of_unknown(request: Request, error: UnknownError) -> JSONResponse:
+        return problem(404, str(error), request)
+
+    @app.exception_handler(TrialError)
+    async def of_trial(request: Request, error: TrialError) -> JSONResponse:
+        return problem(409, str(error), request)
+
+    @app.exception_handler(InputError)
+    async def of_input(request: Request, error: InputError) -> JSONResponse:
+        return problem(422, str(error), request)
+
+    @app.exception_handler(Exception)
+    async def of_any(request: Request, error: Exception) -> JSONResponse:
+        log.error("request failed", extra={"path": request.url.path}, exc_info=error)
+        return problem(500, "see the gateway's log", request)

@@ -1,0 +1,155 @@
+"""`pup serve`: one process with the link to the agents, the studies and the web application."""
+
+import asyncio
+import contextlib
+import json
+import logging
+import signal
+import sys
+import time
+from typing import Any
+
+import uvicorn
+
+from pup.errors import InputError
+from services.gateway.app import application
+from services.gateway.conductor import Conductor
+from services.gateway.config import Config
+from services.gateway.fits import Fits
+from services.gateway.keys import KeyRing, Tokens
+from services.gateway.link import Link
+from services.gateway.metrics import Metrics
+from services.gateway.store import Store
+
+log = logging.getLogger(__name__)
+STANDARD = set(vars(logging.makeLogRecord({}))) | {"message", "taskName"}
+GRACE = 3
+"""For requests to end when the gateway stops, s."""
+
+
+class JsonLines(logging.Formatter):
+    """A JSON object a line: time, level, logger, message, and what was given besides."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        told: dict[str, Any] = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+            + f".{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        told |= {k: v for k, v in vars(record).items() if k not in STANDARD}
+        if record.exc_info:
+            told["error"] = self.formatException(record.exc_info)
+        return json.dumps(told, default=str)
+
+
+def serve(config: Config) -> dict[str, Any]:
+    """Run a gateway until it is told to stop.
+
+    Raises:
+      InputError: a setting, a file or an address cannot be used.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonLines())
+    logging.basicConfig(level=config.log.upper(), handlers=[handler], force=True)
+    for name in ("alembic", "zmq", "asyncio"):
+        logging.getLogger(name).setLevel("WARNING")
+    config.data.mkdir(parents=True, exist_ok=True)
+    tokens, ring = Tokens(config.data / "tokens.json"), KeyRing(config.data / "curve")
+    if not len(tokens):
+        if not config.loopback:
+            raise InputError("no token exists; make one first: pup serve token NAME --role admin")
+        log.warning("no token exists, so nobody can ask; pup serve token NAME --role admin")
+    if not config.loopback and not config.certificate:
+        log.warning("tokens travel unencrypted: set certificate and key, or use a TLS proxy")
+    return asyncio.run(_run(config, tokens, ring))
+
+
+async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
+    store, fits = Store(config.url), Fits()
+    conductor = Conductor(store, fits, Metrics())
+    link = Link(config, ring, conductor)
+    try:
+        await conductor.load()
+        link.start()
+        app = application(store, tokens, conductor, link)
+        server = _Server(
+            uvicorn.Config(
+                app,
+                config.host,
+                config.port,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                ssl_certfile=config.certificate or None,
+                ssl_keyfile=config.key or None,
+                timeout_graceful_shutdown=GRACE,
+                limit_concurrency=1000,
+            )
+        )
+        await _until_stopped(config, conductor, link, server)
+    finally:
+        link.close()
+        fits.close()
+        store.close()
+    if conductor.stopped:
+        raise InputError(str(conductor.stopped))
+    return {"stopped": True}
+
+
+async def _until_stopped(
+    config: Config, conductor: Conductor, link: Link, server: "_Server"
+) -> None:
+    works = [
+        asyncio.create_task(act(), name=name)
+        for name, act in (
+            ("studies", conductor.run),
+            ("link", link.run),
+            ("keys", link.watch),
+            ("web", server.serve),
+        )
+    ]
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, server.stop)
+    log.info("listening", extra={"web": f"{config.host}:{config.port}", "link": config.link})
+    done, _ = await asyncio.wait(works, return_when=asyncio.FIRST_COMPLETED)
+    server.stop()
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(asyncio.shield(works[-1]), 2 * GRACE)
+    for work in works:
+        work.cancel()
+    await asyncio.gather(*works, return_exceptions=True)
+    for work in done:
+        if not work.cancelled() and (error := work.exception()):
+            raise error
+
+
+class _Server(uvicorn.Server):
+    """Uvicorn without signal handlers of its own, which says what it cannot bind."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Any:
+        """The gateway handles signals itself."""
+        yield
+
+    def stop(self) -> None:
+        """Take no more requests and end streams."""
+        self.config.app.state.stopping = True  # type: ignore[union-attr]
+        self.should_exit = True
+
+    async def startup(self, sockets: Any = None) -> None:
+        """Bind.
+
+        Raises:
+          InputError: the address cannot be had.
+        """
+        try:
+            await super().startup(sockets)
+        except SystemExit as error:  # uvicorn ends so
+            place = f"{self.config.host}:{self.config.port}"
+            raise InputError(
+                f"web: {place} cannot be bound; is another gateway running?"
+            ) from error

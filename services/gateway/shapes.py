@@ -1,0 +1,150 @@
+"""What requests and answers look like, for checks and for OpenAPI."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from pup.transfer.study import Gate, Purpose, StudyState, TrialState
+from pup.transfer.study import StudySettings as Defaults
+from services.gateway.records import Row
+
+Eta = Annotated[list[FiniteFloat], Field(min_length=1, max_length=16)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")]
+ROLLOUTS = 2**16
+
+
+class Strict(BaseModel):
+    """A request: what it does not know, it refuses."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class SimulatedRollouts(Strict):
+    """Distances of the policy in simulation, a row for each mu, a column for each eta."""
+
+    eta: Annotated[list[Eta], Field(min_length=2, max_length=4096)]
+    distance: Annotated[
+        list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=4096)]],
+        Field(min_length=1, max_length=4096),
+    ]
+
+    def checked(self, n_eta: int) -> Row:
+        """The rollouts, if they are tables that fit.
+
+        Raises:
+          InputError: they are not.
+        """
+        from pup.errors import InputError
+
+        widths = {len(eta) for eta in self.eta} | {n_eta}
+        lengths = {len(row) for row in self.distance} | {len(self.eta)}
+        if len(widths) > 1 or len(lengths) > 1:
+            raise InputError(
+                f"simulated: each eta needs {n_eta} numbers, each row {len(self.eta)} distances"
+            )
+        if np.size(self.distance) > ROLLOUTS:
+            raise InputError(f"simulated: more than {ROLLOUTS} rollouts")
+        return {"eta": self.eta, "distance": self.distance}
+
+
+class NewStudy(Strict):
+    """A study to make; see the defaults of what is left out."""
+
+    name: Name
+    robot: Annotated[str, Field(min_length=1, max_length=256)]
+    policy: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of policy.json.")]
+    lower: Eta = list(Defaults.lower)
+    upper: Eta = list(Defaults.upper)
+    trials: Annotated[int, Field(ge=1, le=1000)] = Defaults.trials
+    initial: Annotated[int, Field(ge=1, le=1000)] = Defaults.initial
+    repeats: Annotated[int, Field(ge=0, le=100)] = Defaults.repeats
+    compare: Annotated[list[Eta], Field(max_length=16)] = []
+    horizon: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = Defaults.horizon
+    lease: Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] = Defaults.lease
+    failures: Annotated[int, Field(ge=1, le=1000)] = Defaults.failures
+    gate: Gate = Defaults.gate
+    agent: Name | None = None
+    warm_start: bool = Defaults.warm_start
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Defaults.seed
+    simulated: SimulatedRollouts | None = None
+
+
+class Retry(Strict):
+    """An attempt to make."""
+
+    attempt: Annotated[int, Field(ge=2, le=10**6)]
+
+
+class Reason(Strict):
+    """Why, in words."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=500)]
+
+
+class StudyShape(BaseModel):
+    """A study."""
+
+    name: str
+    state: StudyState
+    reason: str
+    chosen: list[float] | None
+    walks: int
+    trials: int
+    farthest: float | None
+    open: int | None
+    settings: dict[str, Any]
+    waits_for: str = ""
+
+
+class StudyList(BaseModel):
+    """A page of studies; `next` goes on where it is given as `after`."""
+
+    studies: list[StudyShape]
+    next: str | None
+
+
+class TrialShape(BaseModel):
+    """A trial."""
+
+    id: str
+    number: int
+    eta: list[float]
+    purpose: Purpose
+    state: TrialState
+    attempt: int
+    agent: str | None
+    released: bool
+    distance: float | None
+    time: float | None
+    reason: str
+    recording: str | None
+    digest: str | None
+
+
+class TrialList(BaseModel):
+    """A page of trials."""
+
+    trials: list[TrialShape]
+    next: int | None
+
+
+class Posterior(BaseModel):
+    """The Gaussian process of a study."""
+
+    walks: int
+    best: dict[str, Any] | None
+    slices: list[dict[str, Any]]
+
+
+class EventList(BaseModel):
+    """A page of what happened."""
+
+    events: list[dict[str, Any]]
+    next: int | None
+
+
+class AgentList(BaseModel):
+    """The agents."""
+
+    agents: list[dict[str, Any]]

@@ -1,0 +1,253 @@
+"""What the gateway must not forget, in SQLite or PostgreSQL through SQLAlchemy.
+
+A change is one transaction: the study, the trials, what happened, all or nothing. Each start of a
+gateway takes a new epoch; a gateway that finds a newer one was replaced and may write no more.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config as Migrations
+from alembic.util import CommandError
+from sqlalchemy.exc import SQLAlchemyError
+
+from pup.errors import InputError
+from pup.transfer.study import Study, Trial
+from services.gateway.records import Row, study_of, study_row, trial_row
+
+T = TypeVar("T")
+ANSWERS_KEPT = 7 * 86400.0  # s
+
+
+class ReplacedError(RuntimeError):
+    """Another gateway was started on the same database."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened.
+
+    Attributes:
+      kind: in a word.
+      who: did it: the name of an agent or of a token, or `gateway`.
+      trial: number, where it was about one.
+      detail: what else is to be known.
+    """
+
+    kind: str
+    who: str = "gateway"
+    trial: int | None = None
+    detail: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a transaction writes of one study."""
+
+    study: Study
+    trials: Sequence[Trial] = ()
+    events: Sequence[Event] = ()
+    simulated: Row | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a request with an idempotency key."""
+
+    key: str
+    who: str
+    request: str
+    status: int
+    body: bytes
+
+
+class Store:
+    """The database of one gateway; its calls run one after the other in a thread of their own.
+
+    Args:
+      url: of SQLAlchemy, such as `sqlite:////var/lib/pup/gateway.db`.
+
+    Raises:
+      InputError: it cannot be opened, or a newer program wrote it.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="store")
+        try:
+            self.engine = sa.create_engine(url)
+            if self.engine.dialect.name == "sqlite":
+                sa.event.listen(self.engine, "connect", _pragmas)
+            with self.engine.begin() as connection:
+                _migrate(connection)
+                tables = sa.MetaData()
+                tables.reflect(connection)
+                self.tables = tables.tables
+                self.epoch = self._take_over(connection)
+        except CommandError as error:
+            raise InputError(f"database: a newer program wrote it ({error})") from error
+        except (SQLAlchemyError, ModuleNotFoundError) as error:
+            place = str(error).splitlines()[0]
+            raise InputError(f"database: cannot be opened ({place})") from error
+
+    async def run(self, act: Callable[[sa.Connection], T]) -> T:
+        """Run a transaction in the store's thread."""
+
+        def transaction() -> T:
+            with self.engine.begin() as connection:
+                return act(connection)
+
+        return await asyncio.get_running_loop().run_in_executor(self._thread, transaction)
+
+    async def write(self, change: Change) -> None:
+        """Write a change whole or not at all.
+
+        Raises:
+          ReplacedError: another gateway has taken over.
+        """
+        await self.run(lambda connection: self._write(connection, change))
+
+    async def log(self, events: Sequence[Event], study: str | None = None) -> None:
+        """Write events that change no trial."""
+        await self.run(lambda connection: self._log(connection, study, events))
+
+    async def studies(self) -> list[tuple[Study, Row | None]]:
+        """All studies with their simulated rollouts, oldest first."""
+        return await self.run(self._studies)
+
+    async def events(self, study: str, after: int, limit: int) -> list[Row]:
+        """What happened in a study, oldest first."""
+        table = self.tables["events"]
+        query = sa.select(table).where(table.c.study == study, table.c.id > after)
+        query = query.order_by(table.c.id).limit(limit)
+        return await self.run(lambda c: [dict(r._mapping) for r in c.execute(query)])
+
+    async def agents(self) -> list[Row]:
+        """What agents said of themselves last."""
+        query = sa.select(self.tables["agents"])
+        return await self.run(lambda c: [dict(r._mapping) for r in c.execute(query)])
+
+    async def met(self, name: str, hello: Row) -> None:
+        """Keep what an agent says of itself."""
+        await self.run(
+            lambda c: self._put(c, "agents", {"name": name}, {"hello": hello, "seen": time.time()})
+        )
+
+    async def answer(self, key: str, who: str) -> Answer | None:
+        """The answer given to a request before."""
+        table = self.tables["answers"]
+        query = sa.select(table).where(table.c.key == key, table.c.who == who)
+        row = await self.run(lambda c: c.execute(query).one_or_none())
+        return row and Answer(row.key, row.who, row.request, row.status, row.body)
+
+    async def answered(self, answer: Answer) -> None:
+        """Keep an answer for whoever asks again; forget those of last week."""
+        table = self.tables["answers"]
+
+        def keep(connection: sa.Connection) -> None:
+            old = table.c.time < time.time() - ANSWERS_KEPT
+            connection.execute(sa.delete(table).where(old))
+            rest = {"request": answer.request, "status": answer.status, "body": answer.body}
+            where = {"key": answer.key, "who": answer.who}
+            self._put(connection, "answers", where, rest | {"time": time.time()})
+
+        await self.run(keep)
+
+    async def writable(self) -> bool:
+        """Whether the database takes writes of this gateway."""
+        try:
+            await self.run(self._check)
+        except (SQLAlchemyError, ReplacedError):
+            return False
+        return True
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._thread.shutdown()
+        self.engine.dispose()
+
+    def _take_over(self, connection: sa.Connection) -> int:
+        table = self.tables["gateways"]
+        last = connection.execute(sa.select(sa.func.max(table.c.epoch))).scalar() or 0
+        connection.execute(sa.insert(table).values(epoch=last + 1, started=time.time()))
+        return last + 1
+
+    def _check(self, connection: sa.Connection) -> None:
+        """Take the right to write, or find that another gateway has it."""
+        table = self.tables["gateways"]
+        mine = sa.update(table).where(table.c.epoch == self.epoch)
+        connection.execute(mine.values(started=table.c.started))  # locks until the commit
+        if connection.execute(sa.select(sa.func.max(table.c.epoch))).scalar() != self.epoch:
+            raise ReplacedError("another gateway was started on this database; this one stops")
+
+    def _write(self, connection: sa.Connection, change: Change) -> None:
+        self._check(connection)
+        row = study_row(change.study)
+        more = {} if change.simulated is None else {"simulated": change.simulated}
+        name = {"name": row.pop("name")}
+        self._put(connection, "studies", name, row | more, {"created": time.time()})
+        for trial in change.trials:
+            row = trial_row(trial)
+            where = {"study": row.pop("study"), "number": row.pop("number")}
+            self._put(connection, "trials", where, row)
+        self._log(connection, change.study.name, change.events)
+
+    def _log(self, connection: sa.Connection, study: str | None, events: Sequence[Event]) -> None:
+        rows = [
+            {
+                "time": time.time(),
+                "study": study,
+                "trial": e.trial,
+                "kind": e.kind,
+                "who": e.who,
+                "detail": e.detail,
+            }
+            for e in events
+        ]
+        if rows:
+            connection.execute(sa.insert(self.tables["events"]), rows)
+
+    def _put(
+        self,
+        connection: sa.Connection,
+        name: str,
+        where: Row,
+        values: Row,
+        first: Row | None = None,
+    ) -> None:
+        """Change a row or, where there is none, add it with what is set but once."""
+        table = self.tables[name]
+        same = sa.and_(*(table.c[column] == value for column, value in where.items()))
+        if not connection.execute(sa.update(table).where(same).values(values)).rowcount:
+            connection.execute(sa.insert(table).values(where | values | (first or {})))
+
+    def _studies(self, connection: sa.Connection) -> list[tuple[Study, Row | None]]:
+        trials: dict[str, list[Row]] = {}
+        for row in connection.execute(sa.select(self.tables["trials"])):
+            trials.setdefault(row.study, []).append(dict(row._mapping))
+        table = self.tables["studies"]
+        rows = connection.execute(sa.select(table).order_by(table.c.created, table.c.name))
+        return [
+            (study_of(dict(row._mapping), trials.get(row.name, [])), row.simulated) for row in rows
+        ]
+
+
+def _pragmas(connection: Any, _: Any) -> None:
+    """A journal that readers do not wait for, and commits that outlive a power cut."""
+    cursor = connection.cursor()
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _migrate(connection: sa.Connection) -> None:
+    migrations = Migrations()
+    migrations.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    migrations.attributes["connection"] = connection
+    command.upgrade(migrations, "head")
