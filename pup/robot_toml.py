@@ -122,6 +122,20 @@ class Table:
             raise self._wrong(key, value, "a whole number")
         return value
 
+    def flag(self, key: str) -> bool:
+        """Take a required true or false."""
+        value = self._take(key)
+        if not isinstance(value, bool):
+            raise self._wrong(key, value, "true or false")
+        return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Take a required list of strings."""
+        value = self._take(key)
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise self._wrong(key, value, "a list of texts")
+        return tuple(value)
+
     def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
         """Take a required list of finite numbers, of a given length when `count` is given."""
         value = self._take(key)

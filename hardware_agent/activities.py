@@ -1,0 +1,217 @@
+"""What the robot does between two ticks: one small class each, asked for a target every tick."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_agent.config import ControlSettings
+from hardware_agent.rollout import Rollout
+from hardware_agent.safety import Senses
+from pup.wire import AgentState, Assign, Outcome
+
+Array = NDArray[np.float64]
+
+RETURN = 0.5  # s from where a walk's end left the joints to the pose that stands
+
+
+@dataclass(frozen=True, eq=False)
+class Ended:
+    """A trial's motion is over.
+
+    Attributes:
+      assign: the trial.
+      outcome: how it ended.
+      reason: in words.
+      rollout: that moved the robot; without rows where it did not come to that.
+      time: that it walked, s; None where it did not.
+    """
+
+    assign: Assign
+    outcome: Outcome
+    reason: str
+    rollout: Rollout
+    time: float | None = None
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The robot has the pose it starts in; it may be put on its feet."""
+
+    assign: Assign
+
+
+@dataclass(frozen=True)
+class Settled:
+    """The robot stands ready; it waits to be told that the trial may run."""
+
+    assign: Assign
+
+
+@dataclass(frozen=True)
+class Walked:
+    """A tick of the walk, for whoever watches.
+
+    Attributes:
+      assign: the trial.
+      number: of the tick.
+      time: since the start, s.
+    """
+
+    assign: Assign
+    number: int
+    time: float
+
+
+Event = Ended | Posed | Settled | Walked
+Emit = Callable[[Event], None]
+
+
+class Activity(Protocol):
+    """What the robot does.
+
+    Attributes:
+      state: what the gateway is told.
+    """
+
+    state: AgentState
+
+    def step(self, senses: Senses) -> "tuple[Array, Activity]":
+        """The target of this tick, rad, and what to do in the next."""
+
+
+@dataclass(eq=False)
+class Hold:
+    """Stay."""
+
+    pose: Array
+    state: AgentState = AgentState.ENABLED
+
+    def step(self, senses: Senses) -> tuple[Array, Activity]:
+        """See Activity."""
+        return self.pose, self
+
+
+@dataclass(eq=False)
+class Lie:
+    """Yield to whoever lifts the robot: the target is where the joints are."""
+
+    state: AgentState = AgentState.ENABLED
+
+    def step(self, senses: Senses) -> tuple[Array, Activity]:
+        """See Activity."""
+        return np.where(np.isnan(senses.position), senses.goal, senses.position), self
+
+
+@dataclass(eq=False)
+class Ramp:
+    """Go from one pose to another, at first and last slowly.
+
+    Attributes:
+      begin: rad.
+      end: rad.
+      duration: s.
+      then: what comes after.
+      state: meanwhile.
+    """
+
+    begin: Array
+    end: Array
+    duration: float
+    then: Activity
+    state: AgentState = AgentState.ENABLED
+    start: float | None = None
+
+    def step(self, senses: Senses) -> tuple[Array, Activity]:
+        """See Activity."""
+        if self.start is None:
+            self.start = senses.time
+        share = min(1.0, (senses.time - self.start) / self.duration)
+        smooth = (1 - np.cos(np.pi * share)) / 2
+        target = self.begin + smooth * (self.end - self.begin)
+        return target, self.then if share >= 1.0 else self
+
+
+@dataclass(eq=False)
+class Settle:
+    """Stand in the start pose until the torso is upright and quiet, and the trial may run.
+
+    Attributes:
+      assign: the trial.
+      rollout: that follows.
+      upright: roll and pitch of the torso in the start pose, rad; None without an IMU.
+      settings: how near to it, how long, and for how long to try.
+      emit: tells of it.
+      placed: set when whoever puts the robot on its feet has done so.
+      go: set when the journal has it that the trial runs.
+    """
+
+    assign: Assign
+    rollout: Rollout
+    upright: Array | None
+    settings: ControlSettings
+    emit: Emit
+    placed: bool = False
+    go: bool = False
+    state: AgentState = AgentState.ARMED
+    begun: float | None = None
+    since: float | None = None
+    told: bool = False
+
+    def step(self, senses: Senses) -> tuple[Array, Activity]:
+        """See Activity."""
+        if self.begun is None:
+            self.begun = senses.time
+            self.emit(Posed(self.assign))
+        if not self.placed or not self._quiet(senses):
+            self.since = None
+        elif self.since is None:
+            self.since = senses.time
+        ready = self.since is not None and senses.time - self.since >= self.settings.settle
+        if self.go:
+            walk = Walk(self.assign, self.rollout, self.settings, self.emit)
+            return walk.step(senses)
+        if ready and not self.told:
+            self.told = True
+            self.emit(Settled(self.assign))
+        if not self.told and senses.time - self.begun > self.settings.patience:
+            self.emit(Ended(self.assign, Outcome.ABORTED, "not upright at the start", self.rollout))
+            return self.rollout.pose, Hold(self.rollout.pose)
+        return self.rollout.pose, self
+
+    def _quiet(self, senses: Senses) -> bool:
+        if self.upright is None or senses.imu is None:
+            return True
+        tilt = np.array([senses.imu.roll, senses.imu.pitch])
+        return bool((np.abs(tilt - self.upright) <= self.settings.upright).all())
+
+
+@dataclass(eq=False)
+class Walk:
+    """Let the policy move the robot."""
+
+    assign: Assign
+    rollout: Rollout
+    settings: ControlSettings
+    emit: Emit
+    cancelled: bool = False
+    state: AgentState = AgentState.RUNNING
+
+    def step(self, senses: Senses) -> tuple[Array, Activity]:
+        """See Activity."""
+        time = self.rollout.time(senses.time)
+        if time >= self.assign.horizon - 1e-9:
+            return self._end(senses, Outcome.SUCCEEDED, "reached the horizon")
+        if self.cancelled:
+            return self._end(senses, Outcome.ABORTED, "cancelled while it walked")
+        target = self.rollout.target(senses)
+        self.emit(Walked(self.assign, len(self.rollout.rows), time))
+        return target, self
+
+    def _end(self, senses: Senses, outcome: Outcome, reason: str) -> tuple[Array, Activity]:
+        time = self.rollout.time(senses.time)
+        self.emit(Ended(self.assign, outcome, reason, self.rollout, time))
+        pose = self.rollout.pose
+        return Ramp(senses.goal, pose, RETURN, Hold(pose)).step(senses)

@@ -1,0 +1,194 @@
+"""The robot as the control loop sees it: its senses, its goals, and being made safe."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_agent.bus import Answers, Bus
+from hardware_agent.config import Settings
+from hardware_agent.imu import Orientation, imu_of
+from hardware_agent.port import BusError
+from hardware_agent.safety import Applied, Guard, Limiter, Response, Senses, Trip
+from pup.errors import InputError
+from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
+
+TILT = 1.0  # rad, of a robot without a gait
+
+
+class Body:
+    """Bus, IMU and rules of safety together.
+
+    Args:
+      settings: of the agent.
+      robot: its description, with a servo for every joint.
+
+    Raises:
+      InputError: a joint has no servo.
+    """
+
+    def __init__(self, settings: Settings, robot: RobotDescription) -> None:
+        self.settings = settings
+        self.names = robot.joint_names
+        ids = [joint.servo_id for joint in robot.joints]
+        if None in ids:
+            lacking = self.names[ids.index(None)]
+            raise InputError(f"{robot.folder / 'robot.toml'}: joint {lacking!r} has no servo_id")
+        self.ids = [number for number in ids if number is not None]
+        self.imu = imu_of(settings.imu)
+        self.bus = Bus(settings.bus, self.ids, senses=settings.imu.kind == "cm740")
+        self.guard = Guard(settings.safety, robot.gait.tilt_limit if robot.gait else TILT)
+        lower = np.array([joint.lower for joint in robot.joints])
+        upper = np.array([joint.upper for joint in robot.joints])
+        self.limiter = Limiter(self.names, lower, upper, settings.safety)
+        self.torque = False
+        self.repeated = self.lost = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        n = len(self.names)
+        self._known = {
+            kind: np.full(n, math.nan)
+            for kind in ("position", "velocity", "load", "voltage", "temperature")
+        }
+        self._seen = np.full(n, -math.inf)
+        self._imu: Orientation | None = None
+        self._imu_seen = -math.inf
+        self._written = -math.inf
+        self.goal = np.full(n, math.nan)
+
+    def open(self) -> list[str]:
+        """Take the bus and the IMU; the servos are limp afterwards.
+
+        Returns:
+          What was put right in the servos.
+
+        Raises:
+          BusError: something does not answer.
+          InputError: something else is there than was configured.
+        """
+        self.torque = False
+        self._forget()
+        put_right = self.bus.open()
+        if self.imu is not None:
+            self.imu.close()
+            self.imu.open()
+        return put_right
+
+    def close(self) -> None:
+        """Give everything up, limp."""
+        self.limp()
+        self.bus.close()
+        if self.imu is not None:
+            self.imu.close()
+
+    def sense(self, now: float, walking: bool) -> Senses:
+        """Ask all sensors.
+
+        Args:
+          now: of the tick, s.
+          walking: whether a rollout is under way.
+
+        Raises:
+          BusError: the bus or the IMU is gone.
+        """
+        if self.imu is not None:
+            self.imu.ask()
+        answers = self.bus.read()
+        alarms = self._take(answers, now)
+        if self.imu is not None:
+            sample = self.imu.take(answers.board, now)
+            if sample is not None:
+                self._imu, self._imu_seen = sample, now
+        return Senses(
+            time=now,
+            names=self.names,
+            **{kind: values.copy() for kind, values in self._known.items()},
+            alarms=alarms,
+            seen=self._seen.copy(),
+            imu=self._imu,
+            imu_seen=self._imu_seen,
+            has_imu=self.imu is not None,
+            goal=self.goal,
+            written=self._written,
+            walking=walking,
+        )
+
+    def _take(self, answers: Answers, now: float) -> dict[str, str]:
+        """Keep what the servos told; returns their complaints."""
+        self.repeated += answers.tries - 1
+        self.lost += len(self.ids) - len(answers.servos)
+        alarms = {}
+        for j, number in enumerate(self.ids):
+            status = answers.servos.get(number)
+            if status is None:
+                continue
+            self._seen[j] = now
+            for kind, values in self._known.items():
+                told = getattr(status, kind)
+                if told is not None:
+                    values[j] = told
+            if status.alarm:
+                alarms[self.names[j]] = self.bus.alarm(number) or status.alarm
+        return alarms
+
+    def enable(self, senses: Senses) -> Trip | None:
+        """Let the servos hold the pose that they are in.
+
+        Returns:
+          Why not, if so.
+        """
+        if np.isnan(senses.position).any() or (senses.has_imu and senses.imu is None):
+            return Trip("enable", "the pose is not known: not every sensor has answered yet")
+        self.guard.reset()
+        self.goal, self._written = senses.position.copy(), senses.time
+        self.bus.prepare(self.goal, self.settings.safety.late)
+        self.bus.torque(True)
+        self.torque = True
+        return None
+
+    def command(self, target: Array, now: float) -> Applied | Trip:
+        """Send a target, as far as the limits let it.
+
+        Args:
+          target: rad, shape (n_joints,).
+          now: of the tick, s.
+        """
+        applied = self.limiter.apply(target, self.goal, 1 / self.settings.control.rate)
+        if isinstance(applied, Applied):
+            self.bus.write(applied.goal)
+            self.goal, self._written = applied.goal, now
+        return applied
+
+    def full_power(self) -> None:
+        """End the softness of a fallen robot."""
+        self.bus.soften(1.0)
+
+    def make_safe(self, response: Response, senses: Senses | None, now: float) -> None:
+        """Make the robot safe; whatever happens, it is not left as it is.
+
+        Args:
+          response: how.
+          senses: of the tick; without them a robot is made limp.
+          now: s.
+        """
+        if response is Response.SOFT and senses is not None and self.torque:
+            try:
+                self.bus.soften(self.settings.safety.fallen_power)
+                self.goal, self._written = senses.position.copy(), now
+                self.bus.write(self.goal)
+                return
+            except (BusError, ValueError):  # a position that is not known is no goal
+                pass
+        self.limp()
+
+    def limp(self) -> bool:
+        """Torque off; False when the bus does not take it."""
+        self.torque = False
+        try:
+            self.bus.torque(False)
+        except BusError:
+            return False
+        return True

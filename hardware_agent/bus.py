@@ -1,0 +1,322 @@
+"""The servo bus: all servos in one question and one command, by ROBOTIS' dynamixel-sdk.
+
+Protocol 1.0 has bulk read and sync write; 2.0 has sync and bulk of both. Answers are collected here
+and not by the SDK's groups: those give up at the first servo that is silent (and with Protocol 1.0
+cannot bulk read at all in release 4.1), while a tick wants what there is and who is missing.
+"""
+
+import math
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+
+from hardware_agent.config import BusSettings
+from hardware_agent.port import FAILURES, BusError, Port, device_error
+from hardware_agent.registers import (
+    BOARD_POWER,
+    BOARD_SENSES,
+    REGISTERS,
+    Span,
+    Status,
+    hardware_alarm,
+    ticks,
+)
+from pup.errors import InputError
+
+POWER_UP = 0.3  # s until servos answer after the board gave them current (e-manual)
+WRITES = 2  # of a command that must arrive: a noise pulse may spoil one packet
+ERROR = {1: 4, 2: 8}
+"""Place of the error byte in a status packet, by protocol; parameters follow."""
+TRAILER = {1: 1, 2: 2}
+"""Bytes of the checksum."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What came back of one question.
+
+    Attributes:
+      servos: by id, those that answered.
+      board: bytes of BOARD_SENSES; None where they were not asked for or did not come.
+      tries: questions that it took.
+    """
+
+    servos: Mapping[int, Status]
+    board: bytes | None
+    tries: int
+
+
+class Bus:
+    """The servos of a robot; the only object that writes to them.
+
+    Args:
+      settings: of the port.
+      ids: of the servos, in the order of the joints.
+      senses: whether the board's inertial sensors are read with the servos.
+    """
+
+    def __init__(self, settings: BusSettings, ids: Sequence[int], senses: bool = False) -> None:
+        self.settings = settings
+        self.ids = tuple(ids)
+        self.registers = REGISTERS[settings.protocol]
+        self._senses = senses
+        self._port = Port(settings.port, settings.baud, settings.timeout)
+        self._packets = PacketHandler(float(settings.protocol))
+        self._turn = 0
+
+    def open(self) -> list[str]:
+        """Take the bus, give the servos current, make them limp and set their EEPROM right.
+
+        Returns:
+          What was put right, in words.
+
+        Raises:
+          BusError: a servo does not answer or is of another kind.
+          BusyError: another program owns the bus.
+        """
+        self._port.close()
+        self.take()
+        with self._told():
+            if self.settings.board is not None:
+                self._power(self.settings.board)
+            self.torque(False)
+            missing = [name for name in self.ids if self._packets.ping(self._use(), name)[1]]
+            if missing:
+                told = ", ".join(map(str, missing))
+                raise BusError(f"{self.settings.port}: no answer from servo {told}")
+            return [told for name in self.ids for told in self._set_up(name)]
+
+    def attach(self) -> None:
+        """Open the port without taking the bus: for who may have to take it over.
+
+        A port that is not there is looked for again then.
+        """
+        with suppress(BusError):
+            self._port.open()
+
+    def take(self) -> None:
+        """Open the port and take the bus; nothing is written.
+
+        Raises:
+          BusError: the port is not there.
+          BusyError: another program owns the bus.
+        """
+        self._port.open()
+        self._port.claim()
+
+    def take_over(self) -> None:
+        """Take the bus when its owner has gone; nothing is written yet.
+
+        Raises:
+          BusError: the port is not there.
+        """
+        if not self._port.is_open:
+            self._port.open()
+        self._port.claim(wait=True)
+
+    def close(self) -> None:
+        """Give the bus up."""
+        self._port.close()
+
+    def read(self) -> Answers:
+        """Ask every servo; who does not answer is asked again, as often as the settings say."""
+        detailed = self._detailed()
+        found: dict[int, Status] = {}
+        board: dict[int, bytes] = {}
+        tries, whole = 0, False
+        while not whole and tries < self.settings.tries:
+            tries += 1
+            left = [name for name in self.ids if name not in found]
+            with self._told():
+                self._ask(left, detailed, board)
+                self._collect(left, detailed, found, board)
+            whole = len(found) == len(self.ids) and bool(board) == self._senses
+        return Answers(found, next(iter(board.values()), None), tries)
+
+    def write(self, goals: Sequence[float]) -> None:
+        """Tell every servo its goal.
+
+        Args:
+          goals: finite, rad, in the order of the ids.
+        """
+        self._send(self.registers.goal, {n: ticks(g) for n, g in zip(self.ids, goals, strict=True)})
+
+    def torque(self, on: bool) -> None:
+        """Make all servos hold, or limp."""
+        for _ in range(WRITES):
+            self._all(self.registers.torque_enable, int(on))
+
+    def prepare(self, goals: Sequence[float], deadline: float) -> None:
+        """Set limp servos up such that they stay where they are when torque comes.
+
+        Args:
+          goals: where they are, rad.
+          deadline: s without an instruction after which servos that can stop by themselves.
+        """
+        own = self.registers
+        for span, value in zip(own.gains, self.settings.gains, strict=True):
+            self._all(span, value)
+        self._all(own.speed, 0)
+        self.soften(1.0)
+        if own.bus_watchdog:
+            self._all(own.bus_watchdog, 0)  # one that has bitten refuses goals until told so
+            self._all(own.bus_watchdog, min(127, math.ceil(deadline / 0.02)))
+        self.write(goals)
+
+    def soften(self, share: float) -> None:
+        """Limit the servos' power to a share of what they have."""
+        for _ in range(WRITES):
+            self._all(self.registers.power_limit, round(share * self.registers.full_power))
+
+    def alarm(self, name: int) -> str:
+        """Why a servo complains, in words."""
+        if self.registers.hardware_error is None:
+            return ""
+        with self._told():
+            address, length = self.registers.hardware_error
+            data, result, _ = self._packets.readTxRx(self._use(), name, address, length)
+        return hardware_alarm(data[0]) if result == COMM_SUCCESS else ""
+
+    def torque_enabled(self, name: int) -> bool | None:
+        """Whether a servo holds; None when it does not answer."""
+        with self._told():
+            address, length = self.registers.torque_enable
+            data, result, _ = self._packets.readTxRx(self._use(), name, address, length)
+        return bool(data[0]) if result == COMM_SUCCESS else None
+
+    def _detailed(self) -> Collection[int]:
+        """Who tells more than its position: all, or one after the other."""
+        if self.settings.detail == "all":
+            return frozenset(self.ids)
+        self._turn = (self._turn + 1) % len(self.ids)
+        return frozenset({self.ids[self._turn]})
+
+    def _span(self, name: int, detailed: Collection[int]) -> Span:
+        if name == self.settings.board:
+            return BOARD_SENSES
+        return self.registers.block if name in detailed else self.registers.position
+
+    def _ask(self, left: Sequence[int], detailed: Collection[int], board: dict[int, bytes]) -> None:
+        port, own = self._use(), self.registers
+        asked = list(left)
+        if self._senses and not board and self.settings.board is not None:
+            asked.append(self.settings.board)
+        if self.settings.read == "sync":
+            address, length = own.block
+            result = self._packets.syncReadTx(port, address, length, asked, len(asked), False)
+        else:
+            parameters: list[int] = []
+            for name in asked:
+                address, length = self._span(name, detailed)
+                if own.protocol == 1:
+                    parameters += [length, name, address]
+                else:
+                    parameters += [
+                        name,
+                        *address.to_bytes(2, "little"),
+                        *length.to_bytes(2, "little"),
+                    ]
+            more = () if own.protocol == 1 else (False,)
+            result = self._packets.bulkReadTx(port, parameters, len(parameters), *more)
+        if result != COMM_SUCCESS:
+            raise BusError(f"{self.settings.port}: {self._packets.getTxRxResult(result)}")
+
+    def _collect(
+        self,
+        left: Sequence[int],
+        detailed: Collection[int],
+        found: dict[int, Status],
+        board: dict[int, bytes],
+    ) -> None:
+        """Sort answers by who they are from, until all are there or it took too long."""
+        protocol = self.registers.protocol
+        at = ERROR[protocol]
+        wanted = set(left)
+        if self._senses and not board and self.settings.board is not None:
+            wanted.add(self.settings.board)
+        more = () if protocol == 1 else (False,)
+        while wanted:
+            packet, result = self._packets.rxPacket(self._port, *more)
+            if result != COMM_SUCCESS:
+                if self._port.isPacketTimeout():
+                    return
+                continue  # spoilt; the next may be sound
+            name = packet[2] if protocol == 1 else packet[4]
+            size = packet[3] if protocol == 1 else packet[5] | packet[6] << 8
+            data = bytes(packet[at + 1 : (4 if protocol == 1 else 7) + size - TRAILER[protocol]])
+            if name not in wanted or len(data) != self._span(name, detailed)[1]:
+                continue
+            wanted.discard(name)
+            if name == self.settings.board:
+                board[name] = data
+            else:
+                found[name] = self.registers.status(data, packet[at], name in detailed)
+
+    def _all(self, span: Span, value: int) -> None:
+        self._send(span, dict.fromkeys(self.ids, value))
+
+    def _send(self, span: Span, values: Mapping[int, int]) -> None:
+        """One packet that writes a register of many servos, who do not answer."""
+        address, length = span
+        parameters: list[int] = []
+        bulk = self.settings.write == "bulk"
+        for name, value in values.items():
+            place = [*address.to_bytes(2, "little"), *length.to_bytes(2, "little")] if bulk else []
+            parameters += [name, *place, *value.to_bytes(length, "little")]
+        with self._told():
+            port = self._use()
+            if bulk:
+                result = self._packets.bulkWriteTxOnly(port, parameters, len(parameters))
+            else:
+                result = self._packets.syncWriteTxOnly(
+                    port, address, length, parameters, len(parameters)
+                )
+        if result != COMM_SUCCESS:
+            raise BusError(f"{self.settings.port}: {self._packets.getTxRxResult(result)}")
+
+    def _power(self, board: int) -> None:
+        address, length = BOARD_POWER
+        power, result, _ = self._one.readTxRx(self._use(), board, address, length)
+        if result != COMM_SUCCESS:
+            raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
+        if power[0] != 1:
+            self._one.writeTxRx(self._use(), board, address, length, [1])
+            time.sleep(POWER_UP)
+
+    @property
+    def _one(self) -> PacketHandler:
+        """The board speaks Protocol 1.0 whatever the servos speak."""
+        return PacketHandler(1.0)
+
+    def _set_up(self, name: int) -> Iterator[str]:
+        """Put a limp servo's lasting settings right."""
+        own, packets = self.registers, self._packets
+        model, result, _ = packets.read2ByteTxRx(self._use(), name, 0)
+        if result == COMM_SUCCESS and model != own.model:
+            raise InputError(
+                f"{self.settings.port}: servo {name} is of model {model}, not an MX-28 with "
+                f"Protocol {own.protocol}.0 (model {own.model}); see [bus] protocol"
+            )
+        for told, span, wanted in (
+            ("return delay", own.return_delay, 0),
+            ("status return level", own.status_level, 2),
+        ):
+            data, result, _ = packets.readTxRx(self._use(), name, *span)
+            if result == COMM_SUCCESS and data[0] != wanted:
+                packets.writeTxRx(self._use(), name, *span, [wanted])
+                yield f"servo {name}: {told} {data[0]} made {wanted}"
+
+    def _use(self) -> Port:
+        """The port, free: with one owner and one thread, nobody else can be using it."""
+        self._port.is_using = False
+        return self._port
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except FAILURES as error:
+            raise BusError(f"{self.settings.port}: {device_error(error)}") from error

@@ -1,0 +1,187 @@
+"""The command line `pup-agent`: runs the agent, and talks to the one that runs."""
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hardware_agent.config import Settings
+from hardware_agent.control import Unreachable, say
+from pup.errors import InputError
+
+DONE, FAILED, REFUSED = 0, 1, 2
+PLACE = "/etc/pup-agent/agent.toml"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Returns:
+      0 done or healthy, 1 unhealthy or failed, 2 bad input or usage.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        return int(VERBS[options.verb](options))
+    except InputError as error:
+        print(f"pup-agent {options.verb}: {' '.join(str(error).splitlines())}", file=sys.stderr)
+        return REFUSED
+    except KeyboardInterrupt:
+        return FAILED
+
+
+def _parser() -> argparse.ArgumentParser:
+    whole = argparse.ArgumentParser(
+        prog="pup-agent", description="Runs trials on a robot, and keeps it whole."
+    )
+    place = os.environ.get("PUP_AGENT_CONFIG", PLACE)
+    verbs = whole.add_subparsers(required=True, dest="verb", metavar="VERB")
+    for name, told in (
+        ("run", "run the agent; the robot does not move until it is enabled"),
+        ("enable", "torque on, holding the pose that the robot is in"),
+        ("disable", "torque off, also when no agent runs; the robot goes limp"),
+        ("stop", "emergency stop: torque off at once"),
+        ("health", "tell how the agent is; exit code 0 when it is well, 1 when not"),
+        ("operate", "stand at the robot: start trials, stop them, type distances"),
+        ("arm", "let the trial that waits start"),
+        ("skip", "do not run the trial that waits"),
+        ("distance", "tell how far the robot came, in metres"),
+        ("keys", "make a pair of CURVE keys for the link"),
+    ):
+        verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
+        verb.add_argument(
+            "--config", type=Path, default=Path(place), metavar="FILE", help="default: %(default)s"
+        )
+        if name == "health":
+            verb.add_argument("--json", action="store_true", help="print one JSON object")
+        elif name == "distance":
+            verb.add_argument("metres", type=float)
+        elif name == "keys":
+            verb.add_argument("name", help="of the files NAME.key and NAME.key_secret")
+            verb.add_argument("--out", type=Path, required=True, metavar="DIR")
+    return whole
+
+
+def _run(options: argparse.Namespace) -> int:
+    from hardware_agent.config import check_together
+    from hardware_agent.daemon import Agent
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    settings = Settings.read(options.config)
+    check_together(settings, options.config)
+    agent = Agent(settings)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: agent.end())
+    agent.run()
+    return DONE
+
+
+def _say(do: str, **more: Any) -> Any:
+    def verb(options: argparse.Namespace) -> int:
+        told = say(Settings.read(options.config).socket, {"do": do, **more})
+        if told:
+            print(told.get("state", json.dumps(told)))
+        return DONE
+
+    return verb
+
+
+def _distance(options: argparse.Namespace) -> int:
+    say(Settings.read(options.config).socket, {"do": "distance", "distance": options.metres})
+    return DONE
+
+
+def _disable(options: argparse.Namespace) -> int:
+    """Ask the agent; without one, take the bus and do it."""
+    settings = Settings.read(options.config)
+    try:
+        say(settings.socket, {"do": "disable"})
+        return DONE
+    except Unreachable:
+        pass
+    from hardware_agent.bus import Bus
+    from hardware_agent.port import BusError
+    from hardware_agent.watchdog import make_limp
+    from pup.robot import RobotDescription
+
+    joints = RobotDescription.load(settings.robot).joints
+    bus = Bus(settings.bus, [j.servo_id for j in joints if j.servo_id is not None])
+    try:
+        bus.take()
+    except BusError as error:
+        print(f"pup-agent disable: {error}", file=sys.stderr)
+        return FAILED
+    return DONE if make_limp(bus) else FAILED
+
+
+def _health(options: argparse.Namespace) -> int:
+    try:
+        told = say(Settings.read(options.config).socket, {"do": "health"})
+    except Unreachable as error:
+        if options.json:
+            print(json.dumps({"problems": [str(error)]}))
+        else:
+            print(error, file=sys.stderr)
+        return FAILED
+    if options.json:
+        print(json.dumps(told, allow_nan=False))
+    else:
+        _show(told)
+    return FAILED if told["problems"] else DONE
+
+
+def _show(told: dict[str, Any]) -> None:
+    loop, hottest = told["loop"], told.get("hottest", {})
+    print(f"{told['agent']} ({told['robot']}): {told['state']} {told['reason']}".rstrip())
+    if loop["period_p99"] is not None:
+        print(
+            f"loop: {loop['ticks']} ticks, {loop['missed']} missed, period "
+            f"{1000 * loop['period_p50']:.2f} ms, p99 {1000 * loop['period_p99']:.2f} ms"
+        )
+    if hottest:
+        print(f"supply {told['supply']} V; {hottest['joint']} {hottest['temperature']} °C")
+    bus = told["bus"]
+    print(f"bus: {bus['repeated']} questions repeated, {bus['lost']} answers lost")
+    print(f"trial: {told['trial']} {told['stage']} {told['waiting']}".rstrip())
+    for problem in told["problems"]:
+        print(f"PROBLEM: {problem}")
+
+
+def _operate(options: argparse.Namespace) -> int:
+    from hardware_agent.prompt import operate
+
+    return operate(Settings.read(options.config).socket)
+
+
+def _keys(options: argparse.Namespace) -> int:
+    import zmq.auth
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    if (options.out / f"{options.name}.key_secret").exists():
+        raise InputError(f"{options.out}: there are keys of this name; use another")
+    for file in zmq.auth.create_certificates(options.out, options.name):
+        print(file)
+    os.chmod(options.out / f"{options.name}.key_secret", 0o600)
+    return DONE
+
+
+VERBS = {
+    "run": _run,
+    "enable": _say("enable"),
+    "disable": _disable,
+    "stop": _say("stop"),
+    "health": _health,
+    "operate": _operate,
+    "arm": _say("arm"),
+    "skip": _say("skip"),
+    "distance": _distance,
+    "keys": _keys,
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,306 @@
+"""One trial after the other: from the book to the robot and back.
+
+accepted → (enabled, cool, and let start by whoever stands there) armed → start pose → put on its
+feet → settled → written down as running → walking → ended → distance → finished.
+"""
+
+import hashlib
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hardware_agent.activities import Ended, Event, Posed, Settled, Walked
+from hardware_agent.config import Settings
+from hardware_agent.distance import Distance, DistanceError
+from hardware_agent.motion import Motion
+from hardware_agent.policies import Shelf
+from hardware_agent.rollout import Rollout, recording_of
+from hardware_agent.trials import TrialBook
+from pup.errors import InputError
+from pup.robot import RobotDescription
+from pup.wire import (
+    CHUNK,
+    AgentState,
+    Armed,
+    Assign,
+    Body,
+    Cancel,
+    Outcome,
+    RecordingChunk,
+    Sample,
+)
+
+SAMPLES = 0.2  # s between two samples
+
+
+class Stage(StrEnum):
+    """Where the current trial is."""
+
+    NONE = "none"
+    WAITING = "waiting"
+    POSING = "posing"
+    PLACING = "placing"
+    SETTLING = "settling"
+    RUNNING = "running"
+    MEASURING = "measuring"
+
+
+class Conductor:
+    """Runs the trials of a book, in the agent's main thread.
+
+    Args:
+      settings: of the agent.
+      robot: its description.
+      book: of trials.
+      motion: the control loop.
+      shelf: of policies.
+      distance: who measures.
+      send: to the gateway.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        robot: RobotDescription,
+        book: TrialBook,
+        motion: Motion,
+        shelf: Shelf,
+        distance: Distance,
+        send: Callable[..., None],
+    ) -> None:
+        self._settings, self._robot = settings, robot
+        self._book, self._motion, self._shelf = book, motion, shelf
+        self._distance, self._send = distance, send
+        self._hands = ThreadPoolExecutor(1, "distance")  # for what takes its time
+        self.stage = Stage.NONE
+        self.waiting = ""
+        self._assign: Assign | None = None
+        self._rollout: Rollout | None = None
+        self._direction = "forward"
+        self._armed = False
+        self._future: Future[Any] | None = None
+        self._ended: Ended | None = None
+        self._recording: tuple[str, str] | None = None
+        self._sampled = 0.0
+
+    @property
+    def trial(self) -> str | None:
+        """The current trial's id."""
+        return self._assign.trial if self._assign else None
+
+    # What others tell.
+
+    def arm(self) -> None:
+        """Whoever stands at the robot lets the trial start.
+
+        Raises:
+          InputError: there is none that waits for it.
+        """
+        if self.stage is not Stage.WAITING:
+            raise InputError("no trial waits to be started")
+        self._armed = True
+
+    def skip(self, reason: str) -> None:
+        """Whoever stands at the robot does not want the trial.
+
+        Raises:
+          InputError: there is none that could be skipped.
+        """
+        if self._assign is None or self.stage is Stage.RUNNING:
+            raise InputError("no trial can be skipped now; `pup-agent stop` stops one that runs")
+        if self.stage is Stage.MEASURING or self.stage is Stage.WAITING:
+            self._finish(Outcome.ABORTED, reason)
+        else:
+            self._motion.cancel(reason)
+
+    def measured(self, distance: float) -> None:
+        """Somebody has measured how far the robot came, in m.
+
+        Raises:
+          InputError: nobody was asked.
+        """
+        if self.stage is not Stage.MEASURING or self._future is not None:
+            raise InputError("no distance is asked for now")
+        if not np.isfinite(distance) or abs(distance) > 1000:
+            raise InputError(f"{distance} is no distance in metres")
+        self._finish(Outcome.SUCCEEDED, self._reason, distance)
+
+    def cancelled(self, cancel: Cancel) -> None:
+        """The gateway takes a trial back."""
+        answers, end = self._book.cancelled(cancel)
+        self._send(*answers)
+        mine = self._assign is not None and cancel.trial == self._assign.trial
+        if mine and (end or self.stage in (Stage.POSING, Stage.PLACING, Stage.SETTLING)):
+            self._motion.cancel("cancelled")
+
+    def handle(self, event: Event) -> None:
+        """Something happened in the control loop."""
+        if self._assign is None or event.assign != self._assign:
+            return
+        if isinstance(event, Posed):
+            self.stage = Stage.PLACING
+            self._future = self._hands.submit(self._distance.start, event.assign, self._direction)
+        elif isinstance(event, Settled):
+            self._begin()
+        elif isinstance(event, Walked):
+            self._sample(event)
+        else:
+            self._over(event)
+
+    def tend(self) -> None:
+        """Do what can be done now."""
+        current = self._book.current
+        if self.stage is Stage.WAITING and current != self._assign:
+            self._reset()
+        if self.stage is Stage.NONE and current is not None:
+            self._take(current)
+        if self.stage is Stage.WAITING:
+            self._start()
+        if self._future is not None and self._future.done():
+            self._collect(self._future)
+
+    def close(self) -> None:
+        """Leave it to the next start."""
+        self._hands.shutdown(wait=False, cancel_futures=True)
+
+    # One stage after the other.
+
+    def _take(self, assign: Assign) -> None:
+        self._assign = assign
+        try:
+            policy = self._shelf.load(assign.policy)
+            self._rollout = Rollout(policy, assign.eta, self._settings.control.rate)
+            self._direction = policy.card.direction
+        except InputError as error:
+            self._finish(Outcome.ABORTED, str(error))
+            return
+        self.stage, self._armed = Stage.WAITING, False
+
+    def _start(self) -> None:
+        assert self._assign is not None and self._rollout is not None
+        self.waiting = self._obstacle()
+        if self.waiting:
+            return
+        refused = self._motion.prepare(self._assign, self._rollout, self._upright())
+        if refused is not None:
+            self.waiting = refused.reason
+            return
+        self.stage = Stage.POSING
+        self._send(Armed(self._assign.trial, self._assign.attempt, self._fence()))
+
+    def _obstacle(self) -> str:
+        """What the trial waits for; empty when for nothing."""
+        status = self._motion.status
+        if status.state is not AgentState.ENABLED:
+            return "enable"
+        if status.senses is not None:
+            hottest = np.nanmax(np.append(status.senses.temperature, -273.0))
+            if hottest > self._settings.safety.cool:
+                return "cool"
+        if self._settings.control.gate == "operator" and not self._armed:
+            return "arm"
+        return ""
+
+    def _upright(self) -> np.ndarray | None:
+        """The torso's roll and pitch in the start pose, rad."""
+        gait = self._robot.gait
+        if self._settings.imu.kind == "none" or gait is None:
+            return None
+        return np.array([0.0, gait.start_pitch or 0.0])
+
+    def _begin(self) -> None:
+        assert self._assign is not None
+        if self._book.current is None or self._book.current.trial != self._assign.trial:
+            self._motion.cancel("cancelled")
+            return
+        self._send(self._book.begin(self._assign))
+        self.stage = Stage.RUNNING
+        self._motion.go(self._assign)
+
+    def _sample(self, event: Walked) -> None:
+        if time.monotonic() - self._sampled < SAMPLES:
+            return
+        self._sampled = time.monotonic()
+        try:
+            distance = self._distance.now()
+        except DistanceError:
+            distance = None
+        key = (event.assign.trial, event.assign.attempt, self._fence())
+        self._send(Sample(*key, event.number, event.time, distance))
+
+    def _over(self, event: Ended) -> None:
+        """The motion has ended; the distance is taken at once, before the robot is touched."""
+        self._ended, self._reason, self._future = event, event.reason, None
+        if event.outcome is Outcome.SUCCEEDED:
+            self.stage = Stage.MEASURING
+            if self._distance.asks:
+                self.waiting = "distance"
+            else:
+                self._future = self._hands.submit(self._distance.end)
+        self._recording = self._record(event)
+        if event.outcome is not Outcome.SUCCEEDED:
+            self._finish(event.outcome, event.reason)
+
+    def _collect(self, future: Future[Any]) -> None:
+        self._future = None
+        try:
+            told = future.result()
+        except DistanceError as error:
+            if self.stage is Stage.MEASURING:
+                self._finish(Outcome.ABORTED, str(error))
+            else:
+                self._motion.cancel(str(error))
+            return
+        if self.stage is Stage.PLACING and self._assign is not None:
+            self.stage = Stage.SETTLING
+            self._motion.placed(self._assign)
+        elif self.stage is Stage.MEASURING:
+            self._finish(Outcome.SUCCEEDED, self._reason, told)
+
+    def _record(self, event: Ended) -> tuple[str, str] | None:
+        """Write the recording, if there was motion; returns its id and its file's digest."""
+        if len(event.rollout.rows) < 2:
+            return None
+        control = self._settings.control
+        notes = f"eta {list(event.assign.eta)}; policy {event.assign.policy}; {event.reason}"
+        made = recording_of(event.assign, event.rollout, self._robot.name, control.source, notes)
+        file = self._file(made.id)
+        made.write(file)
+        return made.id, hashlib.sha256(file.read_bytes()).hexdigest()
+
+    def _finish(self, outcome: Outcome, reason: str, distance: float | None = None) -> None:
+        assert self._assign is not None
+        recording, digest = self._recording or (None, None)
+        walked = self._ended.time if self._ended else None
+        finished = self._book.finish(
+            self._assign, outcome, reason, distance, walked, recording, digest
+        )
+        if recording is not None and self._settings.link.upload:
+            self._send(*self._chunks(recording))
+        self._send(finished)
+        self._reset()
+
+    def _reset(self) -> None:
+        self.stage, self.waiting = Stage.NONE, ""
+        self._assign = self._rollout = self._ended = self._recording = self._future = None
+        self._armed = False
+
+    def _chunks(self, recording: str) -> list[Body]:
+        data = self._file(recording).read_bytes()
+        pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
+        return [
+            RecordingChunk(recording, number, len(pieces), piece)
+            for number, piece in enumerate(pieces)
+        ]
+
+    def _file(self, recording: str) -> Path:
+        return self._settings.state / "recordings" / f"{recording}.parquet"
+
+    def _fence(self) -> int:
+        assert self._assign is not None
+        return self._book.fence(self._assign)

@@ -1,0 +1,395 @@
+"""The agent's configuration, `agent.toml`: read strictly, every mistake told in one line.
+
+What is left out has the default of its attribute below, which may get better with a new version;
+write down only what your robot needs otherwise.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from pup.errors import InputError
+from pup.robot_toml import Table, read_text
+
+LIMIT = 2**18  # bytes
+ADDRESS = re.compile(r"tcp://[^\s*]+:\d+")
+AXIS = re.compile(r"[+-]?[xyz]")
+ANGLE = re.compile(r"[+-]?(heading|roll|pitch)")
+
+
+@dataclass(frozen=True)
+class BusSettings:
+    """The servo bus.
+
+    Attributes:
+      port: serial device.
+      baud: rate, 1/s.
+      protocol: of the servos, 1 or 2.
+      read: "bulk", or with Protocol 2.0 "sync".
+      write: "sync", or with Protocol 2.0 "bulk".
+      detail: "all": every tick reads velocity, load, voltage and temperature of all servos;
+        "rotating": of one servo after the other, positions of all.
+      board: id of a CM-730 or CM-740, which switches the servos' current; 0 for none.
+      timeout: largest delay of an answer beside its time on the wire, s.
+      tries: how often a tick asks those that did not answer.
+      gains: P, I, D of the servos' firmware (paper, section VI-A).
+    """
+
+    port: str
+    baud: int = 1_000_000
+    protocol: int = 1
+    read: str = "bulk"
+    write: str = "sync"
+    detail: str = "all"
+    board: int | None = None
+    timeout: float = 0.004
+    tries: int = 3
+    gains: tuple[int, ...] = (32, 0, 16)
+
+
+@dataclass(frozen=True)
+class ImuSettings:
+    """The IMU, and how it sits in the torso.
+
+    Attributes:
+      kind: "bno055-uart", "bno055-i2c", "cm740" (the board's own, on the servo bus) or "none".
+      port: serial device, or number of the I2C bus.
+      roll: which angle of the BNO055 is the torso's roll; the defaults are the authors' mounting.
+      pitch: likewise; leaning forward must be positive.
+      yaw: likewise.
+      axes: sensor axes that point along the torso's x (forward), y (left) and z (up).
+      timeout: largest delay of an answer beside its time on the wire, s.
+      tries: how often a tick asks.
+    """
+
+    kind: str = "none"
+    port: str = ""
+    roll: str = "-roll"
+    pitch: str = "pitch"
+    yaw: str = "-heading"
+    axes: tuple[str, ...] = ("y", "-x", "z")
+    timeout: float = 0.005
+    tries: int = 3
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """The control loop and how a trial is started.
+
+    Attributes:
+      rate: Hz (paper: 33).
+      clock: "wall", or "lockstep" for a virtual robot whose time moves with its commands.
+      realtime: whether to ask for the real-time scheduler; without the right to, it goes on.
+      ramp: time from the measured pose to another, s.
+      settle: time that the robot must stand upright before it walks, s (authors: 4).
+      patience: time after which a robot that is not upright gives up the trial, s.
+      upright: largest error of roll and pitch at the start, rad (authors: 0.1).
+      gate: who lets a trial start: "operator" or "auto".
+      source: of recordings, "hardware" or "simulation".
+    """
+
+    rate: float = 33.0
+    clock: str = "wall"
+    realtime: bool = True
+    ramp: float = 2.0
+    settle: float = 2.0
+    patience: float = 30.0
+    upright: float = 0.3
+    gate: str = "operator"
+    source: str = "hardware"
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """Limits; see `hardware_agent.safety` for what is held against them.
+
+    Attributes:
+      stale: largest age of a servo's or the IMU's reading in a tick, s.
+      late: largest time without a command while torque is on, s.
+      speed: largest speed of a target, rad/s.
+      voltage: least and largest supply, V (MX-28: 10 to 14.8).
+      temperature: of a servo's case, °C (the MX-28 shuts down at 80).
+      cool: below which a trial starts, °C.
+      heating: °C/s over `heating_time`: the sensor is far from the winding.
+      heating_time: s.
+      current: largest root mean square of a motor's current, as a share of the stall current.
+      current_time: over which it is taken, s.
+      duty_per_radian: of the servo's P gain, to tell the current (fitted, MX-28 at P 32).
+      free_speed: without load, rad/s, likewise.
+      lag: time constant with which a joint follows its target, s, likewise.
+      stuck_time: after which an encoder that does not move is stuck, s.
+      stuck_angle: way that the joint should have gone meanwhile, rad.
+      frozen: time for which a walking robot's IMU may tell the same, s.
+      fall_tilt: largest roll or pitch, rad; None for the gait's.
+      fall_lead: time by which a fall is foreseen from the gyroscope, s.
+      fallen_power: share of the servos' power that is left to a fallen robot.
+    """
+
+    stale: float = 0.02
+    late: float = 0.15
+    speed: float = 8.0
+    voltage: tuple[float, ...] = (9.5, 15.0)
+    temperature: float = 70.0
+    cool: float = 60.0
+    heating: float = 0.5
+    heating_time: float = 10.0
+    current: float = 0.5
+    current_time: float = 20.0
+    duty_per_radian: float = 6.28
+    free_speed: float = 3.9
+    lag: float = 0.05
+    stuck_time: float = 0.18
+    stuck_angle: float = 0.15
+    frozen: float = 0.5
+    fall_tilt: float | None = None
+    fall_lead: float = 0.1
+    fallen_power: float = 0.2
+
+
+@dataclass(frozen=True)
+class WatchdogSettings:
+    """The process that makes the robot safe when the agent cannot.
+
+    Attributes:
+      timeout: without a tick while torque is on, after which the agent is killed, s.
+    """
+
+    timeout: float = 0.3
+
+
+@dataclass(frozen=True)
+class StopSettings:
+    """The emergency stop at the robot.
+
+    Attributes:
+      command: runs as long as the robot may move, such as one that waits for a pin; when it ends,
+        for whatever reason, the robot is stopped.
+    """
+
+    command: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DistanceSettings:
+    """Who tells how far the robot came.
+
+    Attributes:
+      kind: "operator" (asked after a rollout), "hook" (a command) or "virtual" (the virtual robot).
+      command: of the hook, called with `start` and with `end`; see `hardware_agent.distance`.
+      side: socket of the virtual robot.
+      timeout: of the hook, s.
+    """
+
+    kind: str = "operator"
+    command: tuple[str, ...] = ()
+    side: str = ""
+    timeout: float = 30.0
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """The gateway.
+
+    Attributes:
+      gateway: its address; empty for none.
+      key: file with this agent's secret CURVE key.
+      gateway_key: file with the gateway's public key.
+      heartbeat: s between two.
+      liveness: heartbeats of the gateway that may be missed before the connection is made anew.
+      upload: whether recordings are sent too.
+    """
+
+    gateway: str = ""
+    key: str = ""
+    gateway_key: str = ""
+    heartbeat: float = 1.0
+    liveness: float = 3.0
+    upload: bool = True
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All of `agent.toml`.
+
+    Attributes:
+      name: of the agent.
+      robot: built-in name or folder of the robot description.
+      state: folder for journal and recordings.
+      policies: folder of bundles.
+      socket: for commands on this computer.
+    """
+
+    name: str
+    robot: str
+    state: Path
+    policies: Path
+    socket: Path
+    bus: BusSettings
+    imu: ImuSettings
+    control: ControlSettings
+    safety: SafetySettings
+    watchdog: WatchdogSettings
+    stop: StopSettings
+    distance: DistanceSettings
+    link: LinkSettings
+
+    @classmethod
+    def read(cls, file: Path) -> "Settings":
+        """Read a configuration.
+
+        Raises:
+          InputError: a key is unknown, missing or has a value that cannot be.
+        """
+        table = Table.read(read_text(file, LIMIT), file)
+        if table.integer("schema") != 1:
+            raise table.mistake("schema", "not 1; this version reads schema = 1 only")
+        parts = {f.name: f.type for f in fields(cls) if f.name in PARTS}
+        own = {
+            "name": table.name("name"),
+            "robot": table.text("robot"),
+            "state": _path(table, "state", file),
+            "policies": _path(table, "policies", file),
+            "socket": _path(table, "socket", file),
+        }
+        own |= {name: _part(table.table(name), PARTS[name]) for name in parts}
+        table.close()
+        return cls(**own)
+
+
+PARTS: dict[str, type[Any]] = {
+    "bus": BusSettings,
+    "imu": ImuSettings,
+    "control": ControlSettings,
+    "safety": SafetySettings,
+    "watchdog": WatchdogSettings,
+    "stop": StopSettings,
+    "distance": DistanceSettings,
+    "link": LinkSettings,
+}
+CHOICES: Mapping[tuple[str, str], tuple[object, ...]] = {
+    ("BusSettings", "protocol"): (1, 2),
+    ("BusSettings", "read"): ("bulk", "sync"),
+    ("BusSettings", "write"): ("sync", "bulk"),
+    ("BusSettings", "detail"): ("all", "rotating"),
+    ("ImuSettings", "kind"): ("bno055-uart", "bno055-i2c", "cm740", "none"),
+    ("ControlSettings", "clock"): ("wall", "lockstep"),
+    ("ControlSettings", "gate"): ("operator", "auto"),
+    ("ControlSettings", "source"): ("hardware", "simulation"),
+    ("DistanceSettings", "kind"): ("operator", "hook", "virtual"),
+}
+LIMITS: Mapping[tuple[str, str], tuple[float, float]] = {
+    ("BusSettings", "timeout"): (0.0005, 1.0),
+    ("BusSettings", "tries"): (1, 10),
+    ("BusSettings", "board"): (0, 252),
+    ("ImuSettings", "timeout"): (0.0005, 1.0),
+    ("ImuSettings", "tries"): (1, 10),
+    ("ControlSettings", "rate"): (5.0, 500.0),
+    ("ControlSettings", "ramp"): (0.5, 60.0),
+    ("ControlSettings", "settle"): (0.0, 60.0),
+    ("ControlSettings", "patience"): (0.1, 3600.0),
+    ("SafetySettings", "speed"): (0.1, 100.0),
+    ("SafetySettings", "fallen_power"): (0.0, 1.0),
+    ("SafetySettings", "temperature"): (20.0, 80.0),
+    ("WatchdogSettings", "timeout"): (0.05, 10.0),
+    ("LinkSettings", "heartbeat"): (0.05, 60.0),
+    ("LinkSettings", "liveness"): (1.0, 100.0),
+}
+
+
+def _path(table: Table, key: str, file: Path) -> Path:
+    """A path; one that is relative counts from the configuration."""
+    return (file.parent / Path(table.text(key)).expanduser()).absolute()
+
+
+def _part(table: Table, kind: type[Any]) -> Any:
+    hints, read = get_type_hints(kind), {}
+    for f in fields(kind):
+        if table.has(f.name) or (f.name == "port" and kind is BusSettings):
+            value = _value(table, f.name, hints[f.name])
+            _check(table, kind, f.name, value)
+            read[f.name] = value
+    table.close()
+    part = kind(**read)
+    for key, problem in _mistakes(part):
+        raise table.mistake(key, problem)
+    return part
+
+
+def _value(table: Table, key: str, hint: Any) -> Any:
+    if isinstance(hint, UnionType):
+        hint = get_args(hint)[0]
+    if hint is str:
+        return table.text(key)
+    if hint is bool:
+        return table.flag(key)
+    if hint is int:
+        return table.integer(key)
+    if hint is float:
+        return table.number(key)
+    assert get_origin(hint) is tuple
+    if get_args(hint)[0] is str:
+        return table.texts(key)
+    values = table.numbers(key)
+    return tuple(map(int, values)) if get_args(hint)[0] is int else values
+
+
+def _check(table: Table, kind: type[Any], key: str, value: Any) -> None:
+    choices = CHOICES.get((kind.__name__, key))
+    if choices is not None and value not in choices:
+        told = ", ".join(repr(c) for c in choices)
+        raise table.mistake(key, f"{value!r}; use one of {told}")
+    if type(value) in (int, float):
+        low, high = LIMITS.get((kind.__name__, key), (1e-6, 1e9))
+        if not low <= value <= high:
+            raise table.mistake(key, f"{value:g} is outside [{low:g}, {high:g}]")
+
+
+def _mistakes(part: Any) -> Any:
+    """What does not go together."""
+    if isinstance(part, BusSettings):
+        if part.protocol == 1 and (part.read, part.write) != ("bulk", "sync"):
+            yield "protocol", 'Protocol 1.0 has read = "bulk" and write = "sync" only'
+        if part.read == "sync" and part.detail != "all":
+            yield "detail", 'a sync read asks all servos for the same; use detail = "all"'
+        if len(part.gains) != 3 or not all(0 <= gain <= 16383 for gain in part.gains):
+            yield "gains", "write P, I and D of the firmware, such as [32, 0, 16]"
+        if part.protocol == 1 and max(part.gains) > 254:
+            yield "gains", f"{list(part.gains)}; Protocol 1.0 takes 0 to 254"
+    if isinstance(part, ImuSettings):
+        if part.kind.startswith("bno055") and not part.port:
+            yield "port", f"missing; where is the {part.kind}?"
+        for key in ("roll", "pitch", "yaw"):
+            if not ANGLE.fullmatch(getattr(part, key)):
+                yield key, f"{getattr(part, key)!r}; use heading, roll or pitch, perhaps with a -"
+        if len(part.axes) != 3 or not all(AXIS.fullmatch(axis) for axis in part.axes):
+            yield "axes", 'write three of x, y, z, perhaps with a -, such as ["y", "-x", "z"]'
+        elif len({axis[-1] for axis in part.axes}) < 3:
+            yield "axes", "names an axis twice"
+    if isinstance(part, SafetySettings) and (
+        len(part.voltage) != 2 or not part.voltage[0] < part.voltage[1]
+    ):
+        yield "voltage", "write [least, largest]"
+    if isinstance(part, DistanceSettings):
+        if part.kind == "hook" and not part.command:
+            yield "command", "missing; which command measures the distance?"
+        if part.kind == "virtual" and not part.side:
+            yield "side", "missing; write the --side of `pup virtual-robot`"
+    if isinstance(part, LinkSettings) and part.gateway:
+        if not ADDRESS.fullmatch(part.gateway):
+            yield "gateway", f"{part.gateway!r}; write tcp://HOST:PORT"
+        for key in ("key", "gateway_key"):
+            if not getattr(part, key):
+                yield key, "missing; the link is always encrypted, see docs/agent.md"
+
+
+def check_together(settings: Settings, file: Path) -> None:
+    """Refuse parts that need each other.
+
+    Raises:
+      InputError: see the message.
+    """
+    if settings.imu.kind == "cm740" and not settings.bus.board:
+        raise InputError(f'{file}: imu.kind: "cm740" is the board\'s; write its id as bus.board')

@@ -1,0 +1,272 @@
+"""The agent: one process that owns the robot, and what it says to those outside.
+
+The control loop is a thread that waits for nobody; this is everything else, in one loop: gateway,
+commands of this computer, emergency stop, trials, systemd.
+"""
+
+import logging
+import os
+import queue
+import subprocess
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from importlib.metadata import version
+from typing import Any
+
+import zmq
+
+from hardware_agent.activities import Event
+from hardware_agent.body import Body as RobotBody
+from hardware_agent.conductor import Conductor
+from hardware_agent.config import Settings
+from hardware_agent.control import ControlServer
+from hardware_agent.distance import distance_of
+from hardware_agent.health import health
+from hardware_agent.journal import Journal
+from hardware_agent.link import Link
+from hardware_agent.motion import Motion
+from hardware_agent.policies import Shelf
+from hardware_agent.port import BusError
+from hardware_agent.systemd import notify
+from hardware_agent.trials import TrialBook
+from hardware_agent.watchdog import Watchdog
+from pup.errors import InputError
+from pup.robot import RobotDescription
+from pup.wire import (
+    Acknowledge,
+    AgentState,
+    Assign,
+    Body,
+    Cancel,
+    Heartbeat,
+    Hello,
+    Message,
+    Stop,
+)
+
+log = logging.getLogger("pup-agent")
+
+TURN = 0.05  # s, the longest sleep of the loop
+RESEND = 2.0  # s between two sendings of an end that is not acknowledged
+PATIENCE = 5.0  # s that a command waits for the loop
+
+
+class Agent:
+    """The agent.
+
+    Args:
+      settings: of it.
+
+    Raises:
+      InputError: a part of the configuration cannot work here.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._robot = RobotDescription.load(settings.robot)
+        self._body = RobotBody(settings, self._robot)
+        self._book = TrialBook(Journal(settings.state / "journal"))
+        self._shelf = Shelf(settings.policies, self._robot)
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._link = Link(settings.link, self._hello) if settings.link.gateway else None
+        self._control = ControlServer(settings.socket, self.answer)
+        self._stopper: subprocess.Popen[bytes] | None = None
+        self._ending = False
+        self._beaten = self._resent = 0.0
+        self._seen: AgentState | None = None
+
+    def run(self) -> None:
+        """Open the robot and serve until told to end; the robot is limp then."""
+        self._open()
+        bus = self._settings.bus
+        self._watchdog = Watchdog(
+            bus.port, bus.baud, bus.protocol, self._body.ids, self._settings.watchdog.timeout
+        )
+        self._motion = Motion(self._body, self._watchdog, self._happened)
+        self._conductor = Conductor(
+            self._settings,
+            self._robot,
+            self._book,
+            self._motion,
+            self._shelf,
+            distance_of(self._settings.distance),
+            self._send,
+        )
+        self._motion.start()
+        self._control.start()
+        log.info("ready: %s, torque is off", self._settings.name)
+        notify("READY=1")
+        try:
+            while not self._ending:
+                self._turn()
+        finally:
+            self._close()
+
+    def end(self) -> None:
+        """End the agent, from a signal or another thread."""
+        self._ending = True
+        self._ring()
+
+    def answer(self, command: dict[str, Any]) -> dict[str, Any]:
+        """Do a command of this computer; called from other threads.
+
+        Raises:
+          InputError: it cannot be done; the message says why.
+        """
+        if command.get("do") == "stop":  # before anything that may be busy
+            self._motion.stop(str(command.get("reason", "at the robot's computer")))
+            return {}
+        if command.get("do") == "health":
+            return self.health()
+        done: Future[Any] = Future()
+        self._calls.put((lambda: self._command(command), done))
+        self._ring()
+        return done.result(timeout=PATIENCE) or {}
+
+    def health(self) -> dict[str, Any]:
+        """See `hardware_agent.health`."""
+        link = None if self._link is None else self._link.connected
+        told = health(self._settings, self._motion.status, self._watchdog.alive(), link)
+        conductor = self._conductor
+        return told | {
+            "robot": self._robot.name,
+            "trial": conductor.trial,
+            "stage": str(conductor.stage),
+            "waiting": conductor.waiting,
+        }
+
+    def _open(self) -> None:
+        try:
+            for told in self._body.open():
+                log.info("%s", told)
+        except BusError as error:  # it may be switched on later
+            log.warning("%s; trying again", error)
+
+    def _turn(self) -> None:
+        """Sleep until something happens, and see to everything."""
+        self._sleep()
+        while not self._calls.empty():
+            call, done = self._calls.get()
+            try:
+                done.set_result(call())
+            except InputError as error:
+                done.set_exception(error)
+        if self._link is not None:
+            for message in self._link.receive():
+                self._receive(message)
+        while not self._events.empty():
+            self._conductor.handle(self._events.get())
+        self._conductor.tend()
+        self._beat()
+
+    def _sleep(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._bell, zmq.POLLIN)
+        for socket in self._link.sockets if self._link else ():
+            poller.register(socket, zmq.POLLIN)
+        poller.poll(TURN * 1000)
+        with suppress(BlockingIOError):
+            os.eventfd_read(self._bell)
+        if self._stopper is not None and self._stopper.poll() is not None:
+            self._stopper = None
+            self._motion.stop("the emergency stop's command has ended")
+
+    def _receive(self, message: Message) -> None:
+        body = message.body
+        if isinstance(body, Stop):
+            self._motion.stop(f"gateway: {body.reason}")
+        elif isinstance(body, Assign):
+            answers = self._book.assigned(body)
+            if not answers:
+                log.warning("trial %s, attempt %d: not taken", body.trial, body.attempt)
+            self._send(*answers)
+        elif isinstance(body, Cancel):
+            self._conductor.cancelled(body)
+        elif isinstance(body, Acknowledge):
+            self._book.acknowledged(body)
+
+    def _command(self, command: dict[str, Any]) -> dict[str, Any] | None:
+        do = command.get("do")
+        if do == "enable":
+            self._watch_stop()
+            refused = self._motion.enable()
+        elif do == "disable":
+            refused = self._motion.disable()
+        elif do == "arm":
+            return self._conductor.arm()
+        elif do == "skip":
+            return self._conductor.skip(str(command.get("reason", "skipped by the operator")))
+        elif do == "distance":
+            return self._conductor.measured(float(command.get("distance", "nan")))
+        else:
+            raise InputError(f"{do!r} is no command of this agent")
+        if refused is not None:
+            raise InputError(refused.reason)
+        return {"state": str(self._motion.status.state)}
+
+    def _watch_stop(self) -> None:
+        """Start the command that waits for the emergency stop, if there is one."""
+        command = self._settings.stop.command
+        if command and self._stopper is None:
+            try:
+                self._stopper = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+            except OSError as error:
+                raise InputError(f"stop.command: {command[0]}: {error.strerror}") from error
+
+    def _beat(self) -> None:
+        now = time.monotonic()
+        state = self._motion.status.state
+        changed, self._seen = state is not self._seen, state
+        if changed:
+            log.info("%s %s", state, self._motion.status.reason)
+        if now - self._motion.status.tick < 2.0 or not self._motion.status.bus:
+            notify("WATCHDOG=1", f"STATUS={state} {self._motion.status.reason}")
+        if self._link is None:
+            return
+        self._link.tend()
+        if now - self._beaten >= self._settings.link.heartbeat or changed:
+            self._beaten = now
+            told = self.health()
+            self._send(Heartbeat(self._settings.name, state, told, self._conductor.trial))
+        if now - self._resent >= RESEND:
+            self._resent = now
+            self._send(*self._book.owed)
+
+    def _hello(self) -> list[Body]:
+        hello = Hello(
+            self._settings.name,
+            self._robot.name,
+            version("pup"),
+            self._shelf.policies(),
+            self._book.entries(),
+        )
+        return [hello, *self._book.owed]
+
+    def _send(self, *bodies: Body) -> None:
+        if self._link is not None:
+            self._link.send(*bodies)
+
+    def _happened(self, event: Event) -> None:
+        self._events.put(event)
+        self._ring()
+
+    def _ring(self) -> None:
+        with suppress(BlockingIOError, OSError):
+            os.eventfd_write(self._bell, 1)
+
+    def _close(self) -> None:
+        """Limp, then silent."""
+        notify("STOPPING=1")
+        self._motion.close()
+        self._watchdog.close()
+        if self._stopper is not None:
+            self._stopper.terminate()
+        self._control.close()
+        self._conductor.close()
+        if self._link is not None:
+            self._link.close()
+        log.info("ended, torque is off")

@@ -1,0 +1,357 @@
+"""The control loop: a thread that owns the body and does the same few things every tick.
+
+Read all sensors, ask the rules of safety, ask the activity for a target, send it. Others talk to it
+by requests, which it takes between two ticks, and hear of it by events; nobody waits for it, and it
+waits for nobody.
+"""
+
+import gc
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware_agent.activities import (
+    Activity,
+    Ended,
+    Event,
+    Hold,
+    Lie,
+    Ramp,
+    Settle,
+    Walk,
+)
+from hardware_agent.body import Body
+from hardware_agent.metronome import Metronome, Timing
+from hardware_agent.port import BusError
+from hardware_agent.rollout import Rollout
+from hardware_agent.safety import Applied, Response, Senses, Trip
+from hardware_agent.watchdog import Watchdog
+from pup.errors import InputError
+from pup.wire import AgentState, Assign, Outcome
+
+REOPEN = 1.0  # s between tries to find a bus that is gone
+PRIORITY = 20  # of the real-time scheduler
+STATISTICS = 33  # ticks between updates of the loop's statistics
+
+
+@dataclass(frozen=True)
+class MotionStatus:
+    """What the loop tells of itself; published as a whole.
+
+    Attributes:
+      state: of the robot.
+      reason: why it is stopped or at fault; empty otherwise.
+      tick: when this was, s of CLOCK_MONOTONIC.
+      bus: whether the bus works.
+      senses: of the latest tick.
+      timing: of the loop.
+      repeated: questions to servos that had to be repeated, so far.
+      lost: answers that did not come in spite of it.
+      limited: what held the latest target back, by joint.
+    """
+
+    state: AgentState
+    reason: str
+    tick: float
+    bus: bool
+    senses: Senses | None
+    timing: Timing
+    repeated: int
+    lost: int
+    limited: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A request that the robot's state does not allow.
+
+    Attributes:
+      reason: in words.
+    """
+
+    reason: str
+
+
+class Motion(threading.Thread):
+    """The control loop.
+
+    Args:
+      body: the robot; only this thread touches it once it runs.
+      watchdog: is told of every tick; None in tests that do without.
+      emit: called from this thread with what happens to a trial.
+    """
+
+    def __init__(
+        self, body: Body, watchdog: Watchdog | None, emit: Callable[[Event], None]
+    ) -> None:
+        super().__init__(name="motion", daemon=True)
+        self._body, self._watchdog = body, watchdog
+        self._settings = body.settings.control
+        self._emit = emit
+        self.metronome = Metronome(1 / self._settings.rate, self._settings.clock == "lockstep")
+        self._requests: queue.SimpleQueue[Callable[[Senses], Refused | None]] = queue.SimpleQueue()
+        self._wake = threading.Event()
+        self._stop_reason: str | None = None
+        self._quit = False
+        self._activity: Activity | None = None
+        self._state, self._reason = AgentState.DISABLED, ""
+        self._bus = True
+        self._limited: dict[str, str] = {}
+        self._count = 0
+        self._timing = self.metronome.timing()
+        self.status = self._told(None)
+
+    # Requests, from other threads.
+
+    def stop(self, reason: str) -> None:
+        """The emergency stop: limp at once, not at the next tick."""
+        self._stop_reason = reason
+        self._wake.set()
+
+    def enable(self) -> Refused | None:
+        """Hold the pose that the robot is in, with full power."""
+        return self._ask(self._enable)
+
+    def disable(self) -> Refused | None:
+        """Let the robot go limp."""
+        return self._ask(self._disable)
+
+    def prepare(
+        self, assign: Assign, rollout: Rollout, upright: np.ndarray | None
+    ) -> Refused | None:
+        """Go to the start pose and stand ready."""
+        return self._ask(lambda senses: self._prepare(senses, assign, rollout, upright))
+
+    def go(self, assign: Assign) -> None:
+        """The trial that stands ready may run: the journal has it."""
+        self._ask(lambda senses: self._go(assign))
+
+    def placed(self, assign: Assign) -> None:
+        """Whoever puts the robot on its feet has done so, or leaves it to the robot."""
+        self._ask(lambda senses: self._placed(assign))
+
+    def cancel(self, reason: str) -> None:
+        """End the trial that there is, standing."""
+        self._ask(lambda senses: self._cancel(reason))
+
+    def close(self) -> None:
+        """End the thread; the robot is limp afterwards."""
+        self._quit = True
+        self._wake.set()
+        if self.ident is not None:
+            self.join(timeout=5.0)
+
+    def _ask(self, request: Callable[[Senses], Refused | None]) -> Refused | None:
+        done: queue.SimpleQueue[Refused | None] = queue.SimpleQueue()
+
+        def run(senses: Senses) -> None:
+            done.put(request(senses))
+
+        self._requests.put(run)
+        try:
+            return done.get(timeout=2.0)
+        except queue.Empty:
+            return Refused(f"the control loop does not run: {self.status.reason or 'no bus'}")
+
+    # The loop.
+
+    def run(self) -> None:
+        """Tick until closed."""
+        self._realtime()
+        gc.collect()
+        gc.freeze()
+        try:
+            while not self._quit:
+                now = self.metronome.wait(self._wake)
+                self._beat()
+                self._tick(now)
+        finally:
+            self._body.close()
+
+    def _tick(self, now: float) -> None:
+        if self._stop_reason is not None:
+            self._stopped()
+        if not self._bus and not self._reopen():
+            return
+        try:
+            walking = isinstance(self._activity, Walk)
+            senses = self._body.sense(now, walking)
+            if self._body.torque:
+                self._move(senses)
+            while not self._requests.empty():
+                self._requests.get()(senses)
+        except BusError as error:
+            self._bus = False
+            self._trip(Trip("bus", str(error)), None)
+            senses = None
+        self.metronome.pace(not isinstance(self._activity, Ramp | Settle | Walk))
+        self._count += 1
+        if self._count % STATISTICS == 0:
+            self._timing = self.metronome.timing()
+        self.status = self._told(senses)
+
+    def _move(self, senses: Senses) -> None:
+        """Ask the rules, then the activity, and send its target."""
+        trip = self._body.guard.check(senses)
+        if trip is None and self._watchdog is not None and not self._watchdog.alive():
+            trip = Trip("watchdog", "its process has ended")
+        if trip is not None:
+            self._trip(trip, senses)
+            return
+        assert self._activity is not None
+        target, after = self._activity.step(senses)
+        applied = self._body.command(target, senses.time)
+        if isinstance(applied, Trip):
+            self._trip(applied, senses)
+            return
+        self._limited = applied.limited
+        if isinstance(after, Walk):
+            after.rollout.keep(senses, applied)
+        self._become(after)
+
+    def _become(self, activity: Activity) -> None:
+        if isinstance(activity, Walk) != isinstance(self._activity, Walk):
+            (gc.disable if isinstance(activity, Walk) else gc.enable)()
+        self._activity, self._state = activity, activity.state
+
+    def _trip(self, trip: Trip, senses: Senses | None) -> None:
+        """Make the robot safe, and only then tell."""
+        activity = self._activity
+        rows_goal = self._body.goal
+        was_on = self._body.torque
+        self._body.make_safe(trip.response, senses, self.metronome.now())
+        gc.enable()
+        soft = trip.response is Response.SOFT and self._body.torque
+        self._activity = Lie() if soft else None
+        if soft:
+            self._state = AgentState.ENABLED
+        elif was_on or trip.rule in ("bus", "stop"):
+            self._state = AgentState.STOPPED if trip.rule == "stop" else AgentState.FAULT
+            self._reason = str(trip)
+        if isinstance(activity, Walk):
+            self._end_walk(activity, trip, senses, rows_goal)
+        elif (trial := _trial(activity)) is not None:
+            self._emit(Ended(trial.assign, Outcome.ABORTED, str(trip), trial.rollout))
+
+    def _end_walk(self, walk: Walk, trip: Trip, senses: Senses | None, goal: np.ndarray) -> None:
+        if senses is not None:
+            walk.rollout.keep(senses, Applied(goal, {}), self._body.torque)
+        outcome = Outcome.ABORTED
+        if trip.rule == "fall":
+            outcome = Outcome.SUCCEEDED
+        elif trip.rule == "bad target":
+            outcome = Outcome.INFEASIBLE
+        rows = walk.rollout.rows
+        time_walked = rows[-1].time if rows else None
+        self._emit(Ended(walk.assign, outcome, str(trip), walk.rollout, time_walked))
+
+    def _stopped(self) -> None:
+        self._trip(Trip("stop", self._stop_reason or ""), None)
+        self._stop_reason = None
+        self._wake.clear()
+
+    def _reopen(self) -> bool:
+        """Look for a bus that is gone; requests that come meanwhile time out."""
+        self.status = self._told(None)
+        try:
+            self._body.open()
+        except (BusError, InputError) as error:
+            self._reason = f"bus: {error}"
+            self._wake.wait(REOPEN)
+            return False
+        self._bus = True
+        return True
+
+    # What requests do, in this thread.
+
+    def _enable(self, senses: Senses) -> Refused | None:
+        if self._activity is None:
+            trip = self._body.enable(senses)
+            if trip is not None:
+                return Refused(str(trip))
+        else:
+            self._body.full_power()
+        self._reason = ""
+        self._become(Hold(self._body.goal))
+        return None
+
+    def _disable(self, senses: Senses) -> Refused | None:
+        trial = _trial(self._activity)
+        self._body.limp()
+        gc.enable()
+        self._activity = None
+        self._state, self._reason = AgentState.DISABLED, ""
+        if trial is not None:
+            self._emit(Ended(trial.assign, Outcome.ABORTED, "disabled", trial.rollout))
+        return None
+
+    def _prepare(
+        self, senses: Senses, assign: Assign, rollout: Rollout, upright: np.ndarray | None
+    ) -> Refused | None:
+        if self._activity is None:
+            return Refused(f"the robot is {self._state}; enable it first")
+        if _trial(self._activity) is not None:
+            return Refused("another trial is under way")
+        begin = self._body.goal
+        if isinstance(self._activity, Lie):
+            begin = senses.position
+            self._body.command(begin, senses.time)
+            self._body.full_power()
+            self._body.guard.reset()
+        settle = Settle(assign, rollout, upright, self._settings, self._emit)
+        self._become(Ramp(begin, rollout.pose, self._settings.ramp, settle, AgentState.ARMED))
+        return None
+
+    def _go(self, assign: Assign) -> None:
+        if isinstance(self._activity, Settle) and self._activity.assign == assign:
+            self._activity.go = True
+
+    def _placed(self, assign: Assign) -> None:
+        trial = _trial(self._activity)
+        if isinstance(trial, Settle) and trial.assign == assign:
+            trial.placed = True
+
+    def _cancel(self, reason: str) -> None:
+        trial = _trial(self._activity)
+        if isinstance(trial, Walk):
+            trial.cancelled = True
+        elif trial is not None:
+            self._emit(Ended(trial.assign, Outcome.ABORTED, reason, trial.rollout))
+            self._become(Hold(self._body.goal))
+
+    # The rest.
+
+    def _beat(self) -> None:
+        if self._watchdog is not None:
+            self._watchdog.beat(self._body.torque)
+
+    def _told(self, senses: Senses | None) -> MotionStatus:
+        return MotionStatus(
+            state=self._state,
+            reason=self._reason,
+            tick=time.monotonic(),
+            bus=self._bus,
+            senses=senses,
+            timing=self._timing,
+            repeated=self._body.repeated,
+            lost=self._body.lost,
+            limited=self._limited,
+        )
+
+    def _realtime(self) -> None:
+        if self._settings.realtime:
+            with suppress(PermissionError, OSError):  # then it is one thread among others
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+
+
+def _trial(activity: Activity | None) -> Settle | Walk | None:
+    """The part of a trial that an activity is, or leads to."""
+    if isinstance(activity, Ramp):
+        return _trial(activity.then)
+    return activity if isinstance(activity, Settle | Walk) else None

@@ -1,0 +1,59 @@
+"""The policy bundles that lie on the robot's computer."""
+
+import hashlib
+from pathlib import Path
+
+from pup.errors import InputError
+from pup.policy.bundle import CARD, NumpyPolicy
+from pup.robot import RobotDescription
+from pup.wire import Policy
+
+
+def digest_of(bundle: Path) -> str:
+    """What the gateway and the agent call a bundle: SHA-256 of its card, which holds the others'.
+
+    Raises:
+      InputError: there is no card.
+    """
+    try:
+        return hashlib.sha256((bundle / CARD).read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{bundle / CARD}: cannot be read ({error.strerror})") from error
+
+
+class Shelf:
+    """A folder of bundles, or one that is a bundle itself; looked at anew when asked.
+
+    Args:
+      folder: which.
+      robot: that they must be of.
+    """
+
+    def __init__(self, folder: Path, robot: RobotDescription) -> None:
+        self._folder, self._robot = folder, robot
+        self._loaded: tuple[str, NumpyPolicy] | None = None
+
+    def policies(self) -> tuple[Policy, ...]:
+        """All that are there, by name."""
+        return tuple(Policy(path.name, digest_of(path)) for path in self._bundles())
+
+    def load(self, digest: str) -> NumpyPolicy:
+        """A policy; the last one is kept.
+
+        Raises:
+          InputError: it is not there, or not of this robot.
+        """
+        if self._loaded is not None and self._loaded[0] == digest:
+            return self._loaded[1]
+        for path in self._bundles():
+            if digest_of(path) == digest:
+                self._loaded = digest, NumpyPolicy.load(path, self._robot)
+                return self._loaded[1]
+        raise InputError(
+            f"{self._folder}: no policy with digest {digest[:16]}; copy its bundle here"
+        )
+
+    def _bundles(self) -> list[Path]:
+        if (self._folder / CARD).is_file():
+            return [self._folder]
+        return sorted(file.parent for file in self._folder.glob(f"*/{CARD}"))

@@ -1,0 +1,196 @@
+"""Control tables of the MX-28 and the CM-740, as far as the agent uses them, and their units.
+
+ROBOTIS e-manual, MX-28 (Protocol 1.0), MX-28 (2.0), OP2 sub-controller.
+"""
+
+import math
+from dataclasses import dataclass
+
+TICK = 2 * math.pi / 4096  # rad
+CENTRE = 2048  # ticks at an angle of 0
+RPM = 2 * math.pi / 60  # rad/s
+
+Span = tuple[int, int]
+"""Address and length."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a servo tells; None for what was not asked.
+
+    Attributes:
+      position: rad.
+      velocity: rad/s.
+      load: of full scale; inferred by the firmware from its output, not a torque measurement.
+      voltage: V.
+      temperature: °C.
+      alarm: what it complains of, in words; empty for nothing.
+    """
+
+    position: float
+    velocity: float | None = None
+    load: float | None = None
+    voltage: float | None = None
+    temperature: float | None = None
+    alarm: str = ""
+
+
+@dataclass(frozen=True)
+class Registers:
+    """A servo's control table for one protocol.
+
+    Attributes:
+      protocol: 1 or 2.
+      model: number that its servos answer.
+      return_delay: EEPROM; 0 answers at once.
+      status_level: which instructions are answered.
+      torque_enable: 1 holds, 0 is limp.
+      gains: of P, I and D.
+      speed: of the goal's motion; 0 for no limit.
+      goal: position, ticks.
+      power_limit: largest duty.
+      full_power: value of it that limits nothing.
+      bus_watchdog: 20 ms without an instruction after which the servo stops; None without one.
+      hardware_error: bits of what shut the servo down; None where the status packet tells them.
+      position: of the encoder.
+      block: everything a tick wants to know, position included.
+    """
+
+    protocol: int
+    model: int
+    return_delay: Span
+    status_level: Span
+    torque_enable: Span
+    gains: tuple[Span, Span, Span]
+    speed: Span
+    goal: Span
+    power_limit: Span
+    full_power: int
+    bus_watchdog: Span | None
+    hardware_error: Span | None
+    position: Span
+    block: Span
+
+    def status(self, data: bytes, error: int, detailed: bool) -> Status:
+        """What a servo's answer says.
+
+        Args:
+          data: of `block`, or of `position`.
+          error: byte of the status packet.
+          detailed: which of them it is.
+        """
+        alarm = _alarm(self.protocol, error)
+        if not detailed:
+            return Status(
+                angle(int.from_bytes(data, "little", signed=self.protocol == 2)), alarm=alarm
+            )
+        if self.protocol == 1:
+            return Status(
+                angle(_word(data, 0)),
+                _signed(_word(data, 2)) * 0.114 * RPM,
+                _signed(_word(data, 4)) / 1023,
+                data[6] / 10,
+                float(data[7]),
+                alarm,
+            )
+        return Status(
+            angle(int.from_bytes(data[6:10], "little", signed=True)),
+            int.from_bytes(data[2:6], "little", signed=True) * 0.229 * RPM,
+            int.from_bytes(data[0:2], "little", signed=True) / 1000,
+            _word(data, 18) / 10,
+            float(data[20]),
+            alarm,
+        )
+
+
+REGISTERS = {
+    1: Registers(
+        protocol=1,
+        model=29,
+        return_delay=(5, 1),
+        status_level=(16, 1),
+        torque_enable=(24, 1),
+        gains=((28, 1), (27, 1), (26, 1)),
+        speed=(32, 2),
+        goal=(30, 2),
+        power_limit=(34, 2),
+        full_power=1023,
+        bus_watchdog=None,
+        hardware_error=None,
+        position=(36, 2),
+        block=(36, 8),
+    ),
+    2: Registers(
+        protocol=2,
+        model=30,
+        return_delay=(9, 1),
+        status_level=(68, 1),
+        torque_enable=(64, 1),
+        gains=((84, 2), (82, 2), (80, 2)),
+        speed=(112, 4),
+        goal=(116, 4),
+        power_limit=(100, 2),
+        full_power=885,
+        bus_watchdog=(98, 1),
+        hardware_error=(70, 1),
+        position=(132, 4),
+        block=(126, 21),
+    ),
+}
+"""By protocol."""
+
+BOARD_POWER: Span = (24, 1)
+"""CM-740: 1 gives the servos current."""
+BOARD_SENSES: Span = (38, 13)
+"""CM-740: gyro z, y, x, accelerometer x, y, z, and voltage."""
+GYRO_FULL = math.radians(500)  # rad/s at 512 from the centre
+ACCEL_FULL = 4 * 9.80665  # m/s² likewise
+
+ALARMS = {0x01: "input voltage", 0x04: "overheating", 0x20: "overload"}
+"""Bits of Protocol 1.0 that tell of the servo; the others tell of a packet."""
+HARDWARE = {0x01: "input voltage", 0x04: "overheating", 0x10: "electrical shock", 0x20: "overload"}
+"""Bits of the register of Protocol 2.0; 0x08, the motor's encoder, is added by newer servos."""
+
+
+def angle(ticks: int) -> float:
+    """The angle of a joint, rad."""
+    return (ticks - CENTRE) * TICK
+
+
+def ticks(position: float) -> int:
+    """The goal nearest to an angle in rad."""
+    return min(4095, max(0, round(position / TICK) + CENTRE))
+
+
+def hardware_alarm(bits: int) -> str:
+    """What `hardware_error` says, in words."""
+    return _words(HARDWARE, bits)
+
+
+def board_senses(
+    data: bytes,
+) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
+    """Gyro x, y, z in rad/s, accelerometer x, y, z in m/s², and voltage of BOARD_SENSES."""
+    z, y, x, *accel = ((_word(data, 2 * i) - 512) / 512 for i in range(6))
+    ax, ay, az = (ACCEL_FULL * a for a in accel)
+    return (GYRO_FULL * x, GYRO_FULL * y, GYRO_FULL * z), (ax, ay, az), data[12] / 10
+
+
+def _alarm(protocol: int, error: int) -> str:
+    if protocol == 1:
+        return _words(ALARMS, error)
+    return "hardware error" if error & 0x80 else ""
+
+
+def _words(names: dict[int, str], bits: int) -> str:
+    return ", ".join(name for bit, name in names.items() if bits & bit)
+
+
+def _word(data: bytes, at: int) -> int:
+    return data[at] | data[at + 1] << 8
+
+
+def _signed(word: int) -> int:
+    """Ten bits of size and one of direction, of which 1 is clockwise: negative."""
+    size = word & 0x3FF
+    return -size if word & 0x400 else size

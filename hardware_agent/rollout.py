@@ -1,0 +1,174 @@
+"""A rollout: the policy moves the robot, on board, and every tick is kept for the recording.
+
+What the policy sees is what it saw in training (paper, section VI-A): the joints and the torso's
+roll and pitch, now and a tick ago.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_agent.safety import Applied, Senses
+from pup.errors import InputError
+from pup.policy.bundle import NumpyPolicy
+from pup.recording import Recording
+from pup.wire import Assign
+
+Array = NDArray[np.float64]
+
+IMU_COLUMNS = (
+    *("imu/roll", "imu/pitch", "imu/yaw"),
+    *(f"imu/{kind}_{axis}" for kind in ("gyro", "accel") for axis in "xyz"),
+)
+DETAILS = ("velocity", "load", "temperature")
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A tick of a rollout.
+
+    Attributes:
+      time: since its start, s.
+      senses: what was read.
+      applied: what was sent then.
+      torque: whether the servos held.
+    """
+
+    time: float
+    senses: Senses
+    applied: Applied
+    torque: bool = True
+
+
+class Rollout:
+    """A policy at work.
+
+    Args:
+      policy: of the bundle.
+      eta: what it is conditioned on.
+      rate: of the control loop, Hz.
+
+    Raises:
+      InputError: the policy is not for this; the message says why.
+    """
+
+    def __init__(self, policy: NumpyPolicy, eta: Sequence[float], rate: float) -> None:
+        card = policy.card
+        if len(eta) != card.shape.eta:
+            raise InputError(f"eta has {len(eta)} numbers; the policy takes {card.shape.eta}")
+        low, high = card.rates
+        if not low * 0.99 <= rate <= high * 1.01:
+            raise InputError(f"the policy was trained for {low:g} to {high:g} Hz, not {rate:g}")
+        self._policy, self._eta = policy, np.array(eta, dtype=np.float64)
+        self._columns = _columns(card.joints, card.observation)
+        self._offset = card.gait.imu_pitch_offset
+        self._start: float | None = None
+        self._before: Array | None = None
+        self._bins: list[NDArray[np.int64]] = []
+        self.rows: list[Row] = []
+
+    @property
+    def pose(self) -> Array:
+        """That it starts in, rad."""
+        shape = self._policy.card.shape
+        return self._policy.targets(0.0, np.full((1, shape.joints), (shape.bins - 1) // 2))
+
+    def time(self, now: float) -> float:
+        """Since the start of the walk, s."""
+        return 0.0 if self._start is None else now - self._start
+
+    def target(self, senses: Senses) -> Array:
+        """What the policy wants of a tick, rad, shape (n_joints,)."""
+        if self._start is None:
+            self._start = senses.time
+        now = self._reading(senses)
+        seen = np.concatenate([now if self._before is None else self._before, now])
+        self._before = now
+        self._bins.append(self._policy.act(seen[self._columns], self._eta))
+        del self._bins[: -self._policy.card.smoothing]
+        return self._policy.targets(self.time(senses.time), np.array(self._bins))
+
+    def keep(self, senses: Senses, applied: Applied, torque: bool = True) -> None:
+        """Add a tick to the recording."""
+        self.rows.append(Row(self.time(senses.time), senses, applied, torque))
+
+    def _reading(self, senses: Senses) -> Array:
+        roll, pitch = (senses.imu.roll, senses.imu.pitch) if senses.imu else (np.nan, np.nan)
+        return np.concatenate([senses.position, [roll, pitch - self._offset]])
+
+
+def _columns(joints: Sequence[str], names: Sequence[str]) -> NDArray[np.intp]:
+    """Where a policy's entries stand in two readings in a row."""
+    both = [
+        *(f"position_before/{joint}" for joint in joints),
+        *("imu_before/roll", "imu_before/pitch"),
+        *(f"position/{joint}" for joint in joints),
+        *("imu/roll", "imu/pitch"),
+    ]
+    unknown = [name for name in names if name not in both]
+    if unknown:
+        raise InputError(
+            f"the policy wants to see {unknown[0]!r}, which no sensor of this robot is"
+        )
+    return np.array([both.index(name) for name in names], dtype=np.intp)
+
+
+def recording_id(assign: Assign) -> str:
+    """The id of a trial's recording; the same whenever it is asked for."""
+    told = f"{assign.study}_{assign.trial}_{assign.attempt}"
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", told).lstrip(".")[:120]
+
+
+def recording_of(
+    assign: Assign, rollout: Rollout, robot: str, source: str, notes: str
+) -> Recording:
+    """What a rollout did, by CONTRACTS.md.
+
+    Args:
+      assign: the trial.
+      rollout: at its end, with two rows at least.
+      robot: its name.
+      source: `hardware` or `simulation`.
+      notes: free text.
+    """
+    rows = rollout.rows
+    names = rows[0].senses.names
+    extras: dict[str, Array] = {}
+    for kind in DETAILS:
+        values = np.array([getattr(row.senses, kind) for row in rows])
+        extras |= {f"{kind}/{name}": values[:, j] for j, name in enumerate(names)}
+    extras["voltage"] = np.array([row.senses.supply for row in rows])
+    if rows[0].senses.has_imu:
+        told = np.array([_inertial(row) for row in rows])
+        extras |= {name: told[:, j] for j, name in enumerate(IMU_COLUMNS)}
+    extras["torque_enabled"] = np.array([float(row.torque) for row in rows])
+    return Recording(
+        id=recording_id(assign),
+        robot=robot,
+        motion="walk",
+        support="ground",
+        source=source,
+        joints=names,
+        time=np.array([row.time for row in rows]),
+        target=np.array([row.applied.goal for row in rows]),
+        position=np.array([_fresh(row) for row in rows]),
+        extras={name: v for name, v in extras.items() if not np.isnan(v).all()},
+        repeat_of=assign.repeat_of,
+        notes=notes,
+    )
+
+
+def _fresh(row: Row) -> Array:
+    """Positions of the tick itself; a reading of an earlier one is missing in this one."""
+    senses = row.senses
+    return np.where(senses.seen == senses.time, senses.position, np.nan)
+
+
+def _inertial(row: Row) -> Array:
+    imu = row.senses.imu
+    if imu is None or row.senses.imu_seen != row.senses.time:
+        return np.full(len(IMU_COLUMNS), np.nan)
+    return np.concatenate([[imu.roll, imu.pitch, imu.yaw], imu.gyro, imu.accel])

@@ -1,0 +1,468 @@
+"""What stops the robot: a small class per rule, each with its own words.
+
+Every rule is asked once a tick, after the sensors were read and before anything is written, while
+torque is on. It answers None, or why the robot must stop.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_agent.config import SafetySettings
+from hardware_agent.imu import Orientation
+
+Array = NDArray[np.float64]
+
+
+class Response(Enum):
+    """How the robot is made safe.
+
+    Attributes:
+      LIMP: torque off.
+      SOFT: it keeps its pose with a small share of its power: who falls should neither break a gear
+        nor be thrown about.
+    """
+
+    LIMP = "limp"
+    SOFT = "soft"
+
+
+@dataclass(frozen=True)
+class Trip:
+    """A rule that was broken.
+
+    Attributes:
+      rule: its name.
+      reason: in words.
+      response: see Response.
+    """
+
+    rule: str
+    reason: str
+    response: Response = Response.LIMP
+
+    def __str__(self) -> str:
+        return f"{self.rule}: {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Senses:
+    """What a tick knows; arrays in the order of the joints, NaN where nothing is known.
+
+    Attributes:
+      time: of the loop, s.
+      names: of the joints.
+      position: rad.
+      velocity: rad/s.
+      load: of full scale.
+      voltage: V.
+      temperature: °C.
+      alarms: of the servos, in words, by joint.
+      seen: when each servo answered last, s.
+      imu: its latest sample.
+      imu_seen: when that came, s.
+      has_imu: whether there is an IMU at all.
+      goal: written last, rad.
+      written: when, s.
+      walking: whether a rollout is under way.
+    """
+
+    time: float
+    names: tuple[str, ...]
+    position: Array
+    velocity: Array
+    load: Array
+    voltage: Array
+    temperature: Array
+    alarms: dict[str, str]
+    seen: Array
+    imu: Orientation | None
+    imu_seen: float
+    has_imu: bool
+    goal: Array
+    written: float
+    walking: bool
+
+    @property
+    def supply(self) -> float:
+        """Voltage at the servos: the median of what they tell, so that none of them can lie."""
+        known = self.voltage[~np.isnan(self.voltage)]
+        return float(np.median(known)) if len(known) else math.nan
+
+
+class Rule(Protocol):
+    """A rule of safety."""
+
+    name: str
+    response: Response
+
+    def check(self, senses: Senses) -> str | None:
+        """Why the robot must stop; None when all is well."""
+
+    def reset(self) -> None:
+        """Torque comes on: forget the past."""
+
+
+class _Stateless:
+    response = Response.LIMP
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+
+class StaleServo(_Stateless):
+    """A servo that does not answer: dead, unplugged, or the whole bus is."""
+
+    name = "stale servo"
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._age = limits.stale
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        late = np.flatnonzero(senses.time - senses.seen > self._age)
+        if not len(late):
+            return None
+        age = float((senses.time - senses.seen)[late].max())
+        names = ", ".join(senses.names[j] for j in late[:3])
+        more = f" and {len(late) - 3} more" if len(late) > 3 else ""
+        return f"{names}{more} did not answer for {age * 1000:.0f} ms"
+
+
+class StaleImu(_Stateless):
+    """An IMU that does not answer."""
+
+    name = "stale IMU"
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._age = limits.stale
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        age = senses.time - senses.imu_seen
+        if not senses.has_imu or age <= self._age:
+            return None
+        return f"no reading for {age * 1000:.0f} ms"
+
+
+class FrozenImu:
+    """An IMU that answers the same for ever while the robot walks."""
+
+    name, response = "frozen IMU", Response.LIMP
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._longest = limits.frozen
+        self.reset()
+
+    def reset(self) -> None:
+        """See Rule."""
+        self._last: Orientation | None = None
+        self._since = math.nan
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        now = senses.imu
+        if now is None or not senses.walking or self._last is None or not now.same(self._last):
+            self._last, self._since = now, senses.time
+            return None
+        still = senses.time - self._since
+        return f"the same reading for {still:.2f} s of walking" if still > self._longest else None
+
+
+class StaleCommand(_Stateless):
+    """A loop that is late: the servos still pull towards a goal of long ago."""
+
+    name = "stale command"
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._age = limits.late
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        age = senses.time - senses.written
+        return f"no command for {age * 1000:.0f} ms" if age > self._age else None
+
+
+class StuckEncoder:
+    """A position that does not move while its joint should: a torn encoder, or a jammed gear.
+
+    What the joint should do is its target, followed with the lag and the speed of a healthy servo.
+    """
+
+    name, response = "stuck encoder", Response.LIMP
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._lag, self._speed = limits.lag, limits.free_speed
+        self._time, self._angle = limits.stuck_time, limits.stuck_angle
+        self.reset()
+
+    def reset(self) -> None:
+        """See Rule."""
+        self._past: deque[tuple[float, Array, Array]] = deque()
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        expected = senses.position.copy()
+        if self._past:
+            before, _, expected = self._past[-1]
+            step = senses.time - before
+            pull = (senses.goal - expected) * min(1.0, step / self._lag)
+            expected = expected + np.clip(pull, -self._speed * step, self._speed * step)
+        self._past.append((senses.time, senses.position, expected))
+        while len(self._past) > 2 and senses.time - self._past[1][0] >= self._time:
+            self._past.popleft()
+        if senses.time - self._past[0][0] < self._time - 1e-9:
+            return None
+        measured = np.array([position for _, position, _ in self._past])
+        wanted = np.abs(expected - self._past[0][2])
+        still = np.ptp(measured, axis=0) == 0
+        stuck = np.flatnonzero(still & (wanted > self._angle))
+        if not len(stuck):
+            return None
+        j = stuck[0]
+        return (
+            f"{senses.names[j]} reads {measured[-1, j]:.4f} rad for {self._time:g} s "
+            f"while it should have moved by {wanted[j]:.2f} rad"
+        )
+
+
+class OverTemperature(_Stateless):
+    """A servo whose case is hot."""
+
+    name = "over-temperature"
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._limit = limits.temperature
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        hot = np.flatnonzero(senses.temperature >= self._limit)
+        if not len(hot):
+            return None
+        j = hot[np.argmax(senses.temperature[hot])]
+        return f"{senses.names[j]} has {senses.temperature[j]:.0f} °C, limit {self._limit:g}"
+
+
+class Heating:
+    """A case that warms fast: the winding, which the sensor is far from, is far hotter."""
+
+    name, response = "heating", Response.LIMP
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._rate, self._time = limits.heating, limits.heating_time
+        self.reset()
+
+    def reset(self) -> None:
+        """See Rule."""
+        self._past: deque[tuple[float, Array]] = deque()
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        if not self._past or senses.time - self._past[-1][0] >= self._time / 20:
+            self._past.append((senses.time, senses.temperature))
+        while senses.time - self._past[0][0] > self._time:
+            self._past.popleft()
+        rise = senses.temperature - self._past[0][1]
+        fast = np.flatnonzero(rise > self._rate * self._time)
+        if not len(fast):
+            return None
+        j = fast[np.argmax(rise[fast])]
+        took = senses.time - self._past[0][0]
+        return f"{senses.names[j]} warmed by {rise[j]:.0f} °C in {took:.1f} s"
+
+
+class Overload:
+    """Too much current for too long (I²t), told from the servo's own law.
+
+    The duty that the firmware gives for the position error, less what back-EMF takes from it, is
+    the current as a share of the stall current; its square is averaged over some time.
+    """
+
+    name, response = "overload", Response.LIMP
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._limits = limits
+        self.reset()
+
+    def reset(self) -> None:
+        """See Rule: but a winding stays hot while torque is off, so it forgets nothing."""
+        self._last: Senses | None = None
+
+    _heat: Array | None = None
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        limits, last, self._last = self._limits, self._last, senses
+        if last is None:
+            if self._heat is None:
+                self._heat = np.zeros(len(senses.names))
+            return None
+        step = senses.time - last.time
+        speed = (senses.position - last.position) / max(step, 1e-3)
+        duty = np.clip(limits.duty_per_radian * (last.goal - senses.position), -1.0, 1.0)
+        current = np.nan_to_num(duty - speed / limits.free_speed)
+        assert self._heat is not None
+        share = min(1.0, step / limits.current_time)
+        self._heat = self._heat + share * (np.clip(current, -1.5, 1.5) ** 2 - self._heat)
+        hot = np.flatnonzero(self._heat > limits.current**2)
+        if not len(hot):
+            return None
+        j = hot[np.argmax(self._heat[hot])]
+        return (
+            f"{senses.names[j]} draws {math.sqrt(self._heat[j]):.2f} of its stall current over "
+            f"{limits.current_time:g} s, limit {limits.current:g}"
+        )
+
+
+class Voltage(_Stateless):
+    """A supply that is too low or too high."""
+
+    name = "voltage"
+
+    def __init__(self, limits: SafetySettings) -> None:
+        self._least, self._largest = limits.voltage
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        supply = senses.supply
+        if math.isnan(supply) or self._least <= supply <= self._largest:
+            return None
+        return f"{supply:.1f} V is outside {self._least:g} to {self._largest:g} V"
+
+
+class ServoAlarm(_Stateless):
+    """A servo that complains itself."""
+
+    name = "servo alarm"
+
+    def __init__(self, limits: SafetySettings) -> None:
+        pass
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        return "; ".join(f"{name} tells of {what}" for name, what in senses.alarms.items()) or None
+
+
+class Fall:
+    """A walking robot that falls: tilted too far, or about to be by the gyroscope."""
+
+    name, response = "fall", Response.SOFT
+
+    def __init__(self, limits: SafetySettings, tilt: float) -> None:
+        self._tilt, self._lead = limits.fall_tilt or tilt, limits.fall_lead
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def check(self, senses: Senses) -> str | None:
+        """See Rule."""
+        imu = senses.imu
+        if imu is None or not senses.walking:
+            return None
+        for name, angle, rate in (
+            ("roll", imu.roll, imu.gyro[0]),
+            ("pitch", imu.pitch, imu.gyro[1]),
+        ):
+            # A fall is foreseen only in one that has begun: walking swings the torso too.
+            begun = abs(angle) > self._tilt / 2 and angle * rate > 0
+            if abs(angle) + (self._lead * abs(rate) if begun else 0.0) > self._tilt:
+                return f"{name} {angle:.2f} rad at {rate:.1f} rad/s, limit {self._tilt:g} rad"
+        return None
+
+
+RULES = (
+    StaleServo,
+    StaleImu,
+    FrozenImu,
+    StaleCommand,
+    ServoAlarm,
+    Voltage,
+    OverTemperature,
+    Heating,
+    Overload,
+    StuckEncoder,
+)
+
+
+class Guard:
+    """All rules, asked in turn.
+
+    Args:
+      limits: of the configuration.
+      tilt: of the robot's gait, rad.
+    """
+
+    def __init__(self, limits: SafetySettings, tilt: float) -> None:
+        self.rules: list[Rule] = [rule(limits) for rule in RULES] + [Fall(limits, tilt)]
+
+    def reset(self) -> None:
+        """Torque comes on."""
+        for rule in self.rules:
+            rule.reset()
+
+    def check(self, senses: Senses) -> Trip | None:
+        """The first rule that is broken; every rule sees every tick."""
+        told = [(rule, rule.check(senses)) for rule in self.rules]
+        for rule, reason in told:
+            if reason is not None:
+                return Trip(rule.name, reason, rule.response)
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Applied:
+    """What became of a target.
+
+    Attributes:
+      goal: rad, within the limits.
+      limited: by joint, what held it back: "range" or "speed".
+    """
+
+    goal: Array
+    limited: dict[str, str]
+
+
+class Limiter:
+    """Keeps targets within the joints' ranges and speeds; what is no number, it refuses.
+
+    Args:
+      names: of the joints.
+      lower: least angles, rad.
+      upper: largest angles.
+      limits: of the configuration.
+    """
+
+    def __init__(
+        self, names: Sequence[str], lower: Array, upper: Array, limits: SafetySettings
+    ) -> None:
+        self._names = tuple(names)
+        self._lower, self._upper = lower, upper
+        self._speed = limits.speed
+
+    def apply(self, target: Array, last: Array, step: float) -> Applied | Trip:
+        """A target as it may be sent.
+
+        Args:
+          target: wanted, rad.
+          last: sent before.
+          step: time since, s.
+
+        Returns:
+          What may be sent, or the trip of a target that is not finite: it is never mended, for
+          whoever made it does not know what it does.
+        """
+        wrong = np.flatnonzero(~np.isfinite(target))
+        if len(wrong) or target.shape != last.shape:
+            names = ", ".join(self._names[j] for j in wrong[:3])
+            return Trip("bad target", f"the target of {names or 'some joints'} is no number")
+        ranged = np.clip(target, self._lower, self._upper)
+        goal = np.clip(ranged, last - self._speed * step, last + self._speed * step)
+        limited = {self._names[j]: "range" for j in np.flatnonzero(ranged != target)}
+        limited |= {self._names[j]: "speed" for j in np.flatnonzero(goal != ranged)}
+        return Applied(goal, limited)
