@@ -58,16 +58,7 @@ class Bus:
         Returns:
           What comes back, in order.
         """
-        hearing = [
-            device
-            for device in self.devices
-            if device.alive
-            and device.powered
-            and device.protocol == packet.protocol
-            and baud in (None, device.baud)
-        ]
-        for device in hearing:
-            device.hear()
+        hearing = [device for device in self.devices if device.hears(packet.protocol, baud)]
         if packet.instruction in (SYNC_READ, BULK_READ):
             return self._read_in_turn(packet, hearing)
         if packet.instruction in (SYNC_WRITE, BULK_WRITE):

@@ -58,8 +58,15 @@ class Device:
     def written(self, register: Register, value: int) -> None:
         """Act on a new value of a register."""
 
-    def hear(self) -> None:
-        """Note that an instruction came by, for whomever."""
+    def hears(self, protocol: int, baud: int | None) -> bool:
+        """Whether it understands an instruction that comes by, for whomever.
+
+        Args:
+          protocol: of the instruction.
+          baud: at which it was sent; None suits all.
+        """
+        heard = self.alive and self.powered and self.protocol == protocol
+        return heard and baud in (None, self.baud)
 
     def permit(self, register: Register, value: int) -> None:
         """Refuse a value for other reasons than its range.
@@ -74,10 +81,8 @@ class Device:
         Raises:
           RefusedError: the table does not go that far.
         """
-        memory = self.memory
-        memory.check(address, length)
-        self.refresh(memory.table.within(address, length))
-        return bytes(memory.bytes[address : address + length])
+        self.refresh(self.memory.within(address, length))
+        return bytes(self.memory.bytes[address : address + length])
 
     def write(self, address: int, data: bytes) -> None:
         """Write registers; all of them or none.

@@ -21,14 +21,15 @@ TICK = 2 * np.pi / 4096  # rad
 CENTRE = 2048  # ticks at an angle of 0
 NOMINAL = 12.0  # V, of the motors' constants
 EMPTY, FULL = 9.9, 12.6  # V of three cells
-BUFFER = 0.003  # s, of the capacitors at the servos' supply
+SETTLING = STEP / 0.003  # per tick, of the supply with its capacitors
 IDLE = 0.1  # A that a servo draws anyway
 AMBIENT = 25.0  # degrees C
 COPPER = 0.0039  # resistance of a winding per K
 WINDING, CASE = 4.0, 70.0  # J/K
 AIRED = 0.12  # W/K from the case to the air
 HEAT = 20  # ticks between updates of the temperatures
-BUILT_UP = 10.0  # the most that the integral part counts for, as an error in ticks x P
+BUILT_UP = 20_000.0  # the most that the integral part counts for, ticks x P
+LARGE = 1e12
 FILTER = 0.5  # share of a new sample in the speed that the D gain sees
 
 
@@ -129,7 +130,6 @@ class Drives:
         self._gain, self._damping = each("gain") * TICK, each("damping") / STEP
         self._clip = each("clip")
         self._cold = each("stall") / NOMINAL  # N m/V
-        self._strength = self._cold.copy()
         self._back = NOMINAL / each("free_speed")  # V s/rad
         self._amperes = each("current") / each("stall")  # A/(N m)
         self._ohm = NOMINAL / each("current")
@@ -142,10 +142,12 @@ class Drives:
         self._warmth = 1 / each("warmth")
         supplies = [character.supply for character in self.characters]
         self._resistance = np.array([[s.resistance] for s in supplies])
-        self._drain = STEP / np.array([[s.capacity * 3600.0] for s in supplies])  # 1/A
+        self._capacity = np.array([[s.capacity * 3600.0] for s in supplies])  # A s
         self.fresh = np.array([[s.charge] for s in supplies])
         self.charge = self.fresh.copy()
-        self.volts = EMPTY + (FULL - EMPTY) * self.charge
+        self.drawn = np.zeros((lanes, 1))
+        self.refresh()
+        self.volts = self._open.copy()
 
     def rest(self, rows: NDArray[np.intp], angle: Array) -> None:
         """Stop what moves in some lanes; goals and temperatures stay.
@@ -166,6 +168,31 @@ class Drives:
             ticks[place] = kept
         return ticks
 
+    def order(self, what: str, place: tuple[int, int], value: float) -> None:
+        """Change what the registers of one servo say.
+
+        Args:
+          what: name of a field of Orders.
+          place: lane and joint.
+          value: the new one.
+        """
+        getattr(self.orders, what)[place] = value
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Derive what follows from the orders, the temperatures and the charge."""
+        orders = self.orders
+        hot = 1 + COPPER * (self.winding - AMBIENT)
+        self._strength = orders.power * self._cold / hot  # N m/V
+        self._brake = self._strength * self._back  # N m s/rad
+        self._p = self._gain * orders.kp
+        self._d = self._gain * orders.kd * self._damping
+        self.most = self._clip * orders.limit
+        self._open = EMPTY + (FULL - EMPTY) * self.charge
+        self._open -= self._resistance * IDLE * self.joints
+        self._shaped = bool(np.isfinite([orders.speed, orders.acceleration]).any())
+        self._integrating = bool(orders.ki.any())
+
     def tick(self, angle: Array, speed: Array) -> Array:
         """One loop of the firmware and the motors.
 
@@ -183,71 +210,80 @@ class Drives:
 
     def _command(self, ticks: Array) -> None:
         """The firmware: from ticks to duty."""
-        now, orders = self.moving, self.orders
-        self._advance_goal()
+        now = self.moving
+        if self._shaped:
+            self._shape_goal()
+        else:
+            now.goal = self.orders.goal
         error = now.goal - ticks
         now.trend += FILTER * (ticks - now.seen - now.trend)
         now.seen = ticks
-        wanted = orders.kp * error - orders.kd * self._damping * now.trend
-        if orders.ki.any():
-            now.built += STEP * orders.ki * error * orders.power
-            bound = BUILT_UP * CENTRE
-            np.clip(now.built, -bound, bound, out=now.built)
-            wanted += now.built
-        most = self.most
-        duty = np.minimum(np.maximum(self._gain * wanted, -most), most)
-        now.duty = duty * orders.power
+        duty = self._p * error
+        duty -= self._d * now.trend
+        if self._integrating:
+            now.built += STEP * self.orders.ki * error * self.orders.power
+            np.clip(now.built, -BUILT_UP, BUILT_UP, out=now.built)
+            duty += self._gain * now.built
+        np.minimum(duty, self.most, out=duty)
+        np.maximum(duty, -self.most, out=duty)
+        duty *= self.orders.power
+        now.duty = duty
 
-    def _advance_goal(self) -> None:
-        """Move the goals that the firmware holds, at the speed that was asked for."""
+    def _shape_goal(self) -> None:
+        """Move the goals that the firmware holds at the speed and acceleration asked for."""
         now, orders = self.moving, self.orders
-        if np.isinf(orders.speed.min()):
-            now.goal = orders.goal
-            return
         way = orders.goal - now.goal
-        braking = np.sqrt(2 * np.minimum(orders.acceleration, 1e12) * np.abs(way))
-        wanted = np.sign(way) * np.minimum(np.minimum(orders.speed, np.abs(way) / STEP), braking)
-        change = np.minimum(orders.acceleration * STEP, 1e12)
-        now.pace = now.pace + np.clip(wanted - now.pace, -change, change)
-        now.goal = now.goal + STEP * np.where(np.isinf(orders.speed), way / STEP, now.pace)
+        at_once = np.isinf(orders.speed)
+        change = np.minimum(orders.acceleration * STEP, LARGE)
+        braking = np.sqrt(2 * np.minimum(orders.acceleration, LARGE) * np.abs(way))
+        fastest = np.minimum(np.minimum(orders.speed, braking), np.abs(way) / STEP)
+        wanted = np.sign(way) * fastest
+        now.pace = np.where(at_once, 0.0, now.pace + np.clip(wanted - now.pace, -change, change))
+        now.goal = np.where(at_once, orders.goal, now.goal + STEP * now.pace)
 
     def _gear(self, speed: Array) -> None:
         """Motor, friction and play: from duty to the torque on the link."""
-        now = self.moving
-        rotor = now.rotor
-        current = (now.duty * self.volts - self._back * rotor) * self.orders.power
-        now.drive = self._strength * current
-        level = self._kinetic + self._static * np.exp(np.abs(rotor) * self._stribeck)
+        now, rotor, play = self.moving, self.moving.rotor, self._play
+        now.drive = self._strength * now.duty * self.volts
+        now.drive -= self._brake * rotor
+        level = np.abs(rotor)
+        level *= self._stribeck
+        np.exp(level, out=level)
+        level *= self._static
+        level += self._kinetic
         level += self._loaded * np.abs(now.torque)
-        now.bristle = np.minimum(np.maximum(now.bristle + self._grip * rotor, -level), level)
-        net = now.drive - now.bristle - self._viscous * rotor
-        forward = np.where(now.lash >= self._play, np.maximum(net, 0.0), 0.0)
-        backward = np.where(now.lash <= -self._play, np.minimum(net, 0.0), 0.0)
-        now.torque = forward + backward
-        now.rotor = np.where(now.torque == 0.0, rotor + self._kick * net, speed)
-        lash = now.lash + STEP * (now.rotor - speed)
-        now.lash = np.minimum(np.maximum(lash, -self._play), self._play)
+        bristle = now.bristle
+        bristle += self._grip * rotor
+        np.minimum(bristle, level, out=bristle)
+        np.maximum(bristle, -level, out=bristle)
+        net = now.drive - bristle
+        net -= self._viscous * rotor
+        # A rotor ahead of the link by the whole play can only push it forward, one behind backward.
+        now.torque = np.minimum(net, (now.lash >= play) * LARGE)
+        np.maximum(now.torque, (now.lash <= -play) * -LARGE, out=now.torque)
+        net *= self._kick
+        net += rotor
+        now.rotor = np.where(now.torque == 0.0, net, speed)
+        lash = now.lash
+        lash += STEP * (now.rotor - speed)
+        np.minimum(lash, play, out=lash)
+        np.maximum(lash, -play, out=lash)
 
     def _supply(self) -> None:
-        """The battery sags under what the servos draw, and drains."""
-        drawn = (self.moving.duty * self.moving.drive * self._amperes).sum(axis=1, keepdims=True)
-        drawn += IDLE * self.joints
-        self.charge -= self._drain * drawn
-        open_circuit = EMPTY + (FULL - EMPTY) * self.charge
-        self.volts += STEP / BUFFER * (open_circuit - self._resistance * drawn - self.volts)
-
-    @property
-    def most(self) -> Array:
-        """The duty that each servo may use."""
-        return self._clip * self.orders.limit
+        """The supply sags under what the servos draw."""
+        now = self.moving
+        power = now.duty * now.drive
+        power *= self._amperes
+        self.drawn = np.add.reduce(power, axis=1, keepdims=True)
+        self.volts += SETTLING * (self._open - self._resistance * self.drawn - self.volts)
 
     def cool(self) -> None:
         """Everything is as warm as the room."""
         self.winding[:] = self.case[:] = AMBIENT
-        self._strength = self._cold.copy()
+        self.refresh()
 
     def heat(self, time: float) -> None:
-        """Warm windings and cases up.
+        """Warm windings and cases up, and drain the battery.
 
         Args:
           time: since the last call, s.
@@ -257,4 +293,5 @@ class Drives:
         through = (self.winding - self.case) * self._warmth
         self.winding += time / WINDING * (hot * current**2 - through)
         self.case += time / CASE * (through - AIRED * (self.case - AMBIENT))
-        self._strength = self._cold / (1 + COPPER * (self.winding - AMBIENT))
+        self.charge -= time * (self.drawn + IDLE * self.joints) / self._capacity
+        self.refresh()

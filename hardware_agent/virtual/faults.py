@@ -124,7 +124,8 @@ class Faults:
 
     def _low_battery(self, told: Mapping[str, Any], on: bool) -> None:
         if on:
-            self.robot.plant.drives.charge[0] = _number(told, "charge", 0.0, -4.0, 1.0)
+            self.robot.plant.drives.charge[0] = _number(told, "charge", 0.0, -1.0, 1.0)
+            self.robot.plant.drives.refresh()
         else:
             self.robot.battery()
 

@@ -4,7 +4,7 @@ The fusion of a BNO055 runs at 100 Hz; what it says is some samples old.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,22 +16,26 @@ from hardware_agent.virtual.skeleton import STEP
 Array = NDArray[np.float64]
 
 EVERY = round(0.01 / STEP)  # steps between samples
+BLOCK = 256  # samples whose noise is drawn at once
 GRAVITY = 9.81  # m/s2
+FORCE_NOISE = 0.02  # m/s2
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One sample of all lanes, in the frame of the torso as the mount believes it to be.
+    """What was there to be measured at one time, of all lanes.
 
     Attributes:
-      turn: quaternions to the world, shape (n_lanes, 4).
-      rate: rad/s, shape (n_lanes, 3).
-      force: specific force, m/s2, shape (n_lanes, 3); upwards at rest.
+      turn: of the torso, quaternions to the world, shape (n_lanes, 4).
+      rate: about its axes, rad/s, shape (n_lanes, 3).
+      force: specific force in the world, m/s2, shape (n_lanes, 3); upwards at rest.
+      noise: standard normal numbers, shape (n_lanes, 9).
     """
 
     turn: Array
     rate: Array
     force: Array
+    noise: Array
 
 
 class Imus:
@@ -44,10 +48,11 @@ class Imus:
     def __init__(self, characters: Sequence[Character]) -> None:
         self._kinds = [character.imu for character in characters]
         self._rngs = [np.random.default_rng((character.seed, 0x1A0)) for character in characters]
-        self._mount = np.array([_turn(kind.mount) for kind in self._kinds])
+        self._mounts = [_turn(kind.mount) for kind in self._kinds]
         self._delay = [round(kind.delay / STEP / EVERY) for kind in self._kinds]
         self._past: deque[Sample] = deque(maxlen=max(self._delay) + 1)
         self._velocity = np.zeros((len(characters), 3))
+        self._noise = self._draw()
 
     def rest(self, rows: NDArray[np.intp], qpos: Array, qvel: Array) -> None:
         """Robots were put down: nothing of their past is left."""
@@ -59,52 +64,68 @@ class Imus:
             for kept, new in zip(vars(sample).values(), vars(now).values(), strict=True):
                 kept[rows] = new[rows]
 
-    def sample(self, steps: int, qpos: Array, qvel: Array) -> None:
-        """Take a sample if its time has come."""
-        if steps % EVERY == 0:
-            self._past.append(self._measure(qpos, qvel))
+    def sample(self, qpos: Array, qvel: Array) -> None:
+        """Take a sample; to be called every EVERY steps."""
+        self._past.append(self._measure(qpos, qvel))
 
     def read(self, lane: int) -> tuple[Array, Array, Array]:
-        """What one robot's IMU says now: quaternion, rate and specific force; see Sample."""
+        """What one robot's IMU says now, in the torso's axes as its mount should be.
+
+        Returns:
+          The quaternion to the world, rates in rad/s, specific force in m/s2.
+        """
         late = min(self._delay[lane], len(self._past) - 1)
         sample = self._past[len(self._past) - 1 - late]
-        return sample.turn[lane], sample.rate[lane], sample.force[lane]
+        kind, mount, noise = self._kinds[lane], self._mounts[lane], sample.noise[lane]
+        turn = multiply(sample.turn[lane], multiply(mount, _turn(kind.noise * noise[:3])))
+        rate = rotate(conjugate(mount), sample.rate[lane])
+        force = rotate(conjugate(turn), sample.force[lane])
+        return (
+            turn,
+            rate + kind.rate_bias + kind.rate_noise * noise[3:6],
+            force + FORCE_NOISE * noise[6:],
+        )
 
     def _measure(self, qpos: Array, qvel: Array) -> Sample:
-        noise = np.stack([rng.standard_normal(9) for rng in self._rngs])
-        off = np.array([[kind.noise] for kind in self._kinds]) * noise[:, :3]
-        shaken = multiply(self._mount, np.array([_turn(angles) for angles in off]))
-        turn = multiply(qpos[:, 3:7], shaken)
-        change = (qvel[:, :3] - self._velocity) / (EVERY * STEP)
+        noise = next(self._noise, None)
+        if noise is None:
+            self._noise = self._draw()
+            noise = next(self._noise)
+        force = (qvel[:, :3] - self._velocity) / (EVERY * STEP)
+        force[:, 2] += GRAVITY
         self._velocity = qvel[:, :3].copy()
-        change[:, 2] += GRAVITY
-        rate = rotate(conjugate(self._mount), qvel[:, 3:6])
-        rate += np.array([kind.rate_bias for kind in self._kinds])
-        rate += np.array([[kind.rate_noise] for kind in self._kinds]) * noise[:, 3:6]
-        force = rotate(conjugate(turn), change) + 0.02 * noise[:, 6:]
-        return Sample(turn, rate, force)
+        return Sample(qpos[:, 3:7].copy(), qvel[:, 3:6].copy(), force, noise)
+
+    def _draw(self) -> Iterator[Array]:
+        """Noise of the next samples."""
+        return iter(np.stack([rng.standard_normal((BLOCK, 9)) for rng in self._rngs], axis=1))
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Products of quaternions (w, x, y, z), row by row."""
-    w, v = a[..., :1], a[..., 1:]
-    x, u = b[..., :1], b[..., 1:]
-    scalar = w * x - (v * u).sum(axis=-1, keepdims=True)
-    return np.concatenate([scalar, w * u + x * v + np.cross(v, u)], axis=-1)
+    """The product of two quaternions (w, x, y, z)."""
+    w, x, y, z = a.tolist()
+    s, i, j, k = b.tolist()
+    return np.array(
+        [
+            w * s - x * i - y * j - z * k,
+            w * i + x * s + y * k - z * j,
+            w * j - x * k + y * s + z * i,
+            w * k + x * j - y * i + z * s,
+        ]
+    )
 
 
 def conjugate(turn: Array) -> Array:
-    """The opposite turns."""
+    """The opposite turn."""
     return turn * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def rotate(turn: Array, vector: Array) -> Array:
-    """Vectors turned, row by row."""
-    pure = np.concatenate([np.zeros((*vector.shape[:-1], 1)), vector], axis=-1)
-    return multiply(multiply(turn, pure), conjugate(turn))[..., 1:]
+    """A vector turned."""
+    return multiply(multiply(turn, np.array([0.0, *vector])), conjugate(turn))[1:]
 
 
 def _turn(angles: Array) -> Array:
     """The quaternion of a small turn about x, y, z, rad."""
-    half = np.concatenate([[1.0], np.asarray(angles) / 2])
-    return np.asarray(half / np.linalg.norm(half))
+    half = np.array([1.0, *(angles / 2)])
+    return half / np.linalg.norm(half)

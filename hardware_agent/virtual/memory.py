@@ -43,14 +43,17 @@ class Memory:
     def __init__(self, table: ControlTable) -> None:
         self.table = table
         self.bytes = bytearray(table.size)
+        self._places = {
+            r.name: (slice(r.address, r.end), (r.low or 0) < 0) for r in table.registers
+        }
+        self._stretches: dict[tuple[int, int], list[Register]] = {}
         for register in table.registers:
             self.put(register.name, register.initial)
 
     def get(self, name: str) -> int:
         """The value of a register; signed where it can be negative."""
-        register = self.table.names[name]
-        raw = self.bytes[register.address : register.end]
-        return int.from_bytes(raw, "little", signed=(register.low or 0) < 0)
+        place, signed = self._places[name]
+        return int.from_bytes(self.bytes[place], "little", signed=signed)
 
     def put(self, name: str, value: int) -> None:
         """Set a register without asking; negative numbers as two's complement."""
@@ -64,14 +67,20 @@ class Memory:
             if not register.lasting:
                 self.put(register.name, register.initial)
 
-    def check(self, address: int, length: int) -> None:
-        """Refuse a stretch of addresses that the table does not have.
+    def within(self, address: int, length: int) -> list[Register]:
+        """Registers of which a stretch of addresses has a byte.
 
         Raises:
-          RefusedError: with the fault.
+          RefusedError: the table does not go that far.
         """
-        if length == 0 or address + length > self.table.size:
-            raise RefusedError(Fault.RANGE)
+        stretch = address, length
+        if stretch not in self._stretches:
+            end = address + length
+            if length == 0 or end > self.table.size:
+                raise RefusedError(Fault.RANGE)
+            touched = [r for r in self.table.registers if r.address < end and address < r.end]
+            self._stretches[stretch] = touched
+        return self._stretches[stretch]
 
     def writable(self, address: int, data: bytes, locked: bool) -> list[tuple[Register, int]]:
         """The registers that a write would change, with their new values.
@@ -84,11 +93,10 @@ class Memory:
         Raises:
           RefusedError: one of them cannot be written, or not this value.
         """
-        self.check(address, len(data))
-        registers = self.table.within(address, len(data))
+        registers = self.within(address, len(data))
         if not registers:
             raise RefusedError(Fault.ACCESS)
-        after = bytearray(self.bytes)
+        after = self.bytes.copy()
         after[address : address + len(data)] = data
         changes = []
         for register in registers:

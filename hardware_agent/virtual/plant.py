@@ -6,6 +6,7 @@ few; what hangs on a bus is one lane. Joint vectors are in the robot's order.
 
 from collections import deque
 from collections.abc import Sequence
+from enum import IntEnum
 
 import numpy as np
 from mujoco.batch import Batch
@@ -13,12 +14,26 @@ from numpy.typing import NDArray
 
 from hardware_agent.virtual.character import Character, draw
 from hardware_agent.virtual.drives import HEAT, Drives
-from hardware_agent.virtual.imu import Imus
+from hardware_agent.virtual.imu import EVERY, Imus
 from hardware_agent.virtual.skeleton import STEP, bodies_of, build, standing
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
+HEIGHT = 0.5  # m by which a robot hangs higher than it stands
 GRIP = 0.5  # s for which a hand still holds a robot whose servos have all got torque
+
+
+class Hold(IntEnum):
+    """How a robot is held.
+
+    NOT: it stands or lies by itself.
+    HAND: a hand keeps it in its start pose until all servos have had torque for a moment.
+    ROPE: it hangs in the air by its torso.
+    """
+
+    NOT = 0
+    HAND = 1
+    ROPE = 2
 
 
 class Plant:
@@ -37,6 +52,9 @@ class Plant:
         self.batch.set_models(models)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._force = self.batch.bind("qfrc_applied")
+        if robot.floating:
+            self._welds = self.batch.bind("eq_active")
+            self._hand, self._palm = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
         joints = [models[0].joint(name) for name in robot.joint_names]
         self.at = _stretch([int(joint.qposadr[0]) for joint in joints])
         self.dofs = _stretch([int(joint.dofadr[0]) for joint in joints])
@@ -47,7 +65,7 @@ class Plant:
         self.imus = Imus(self.characters) if robot.floating else None
         self.steps = 0
         self.ordered = 0  # goals ever given
-        self.held = np.zeros(len(models), dtype=bool)
+        self.held = np.full(len(models), Hold.NOT)
         self._grip = np.zeros(len(models), dtype=int)
         self._late: deque[tuple[int, int, int, float]] = deque()
         self.place(range(len(models)))
@@ -74,19 +92,29 @@ class Plant:
         """True speeds of the joints, rad/s, shape (n_lanes, n_joints)."""
         return np.asarray(self.qvel[:, self.dofs])
 
-    def place(self, lanes: Sequence[int], hold: bool = False) -> None:
+    def place(self, lanes: Sequence[int], hold: Hold = Hold.NOT) -> None:
         """Put robots down at rest in their start pose; what their servos were told stays.
 
         Args:
           lanes: which robots.
-          hold: whether a hand keeps them there until their servos hold them.
+          hold: how they are held there.
         """
         rows = np.array(lanes, dtype=np.intp)
         self.qpos[rows], self.qvel[rows] = self.start[rows], 0.0
+        if self.robot.floating:
+            self.qpos[rows, 2] += HEIGHT * (hold is Hold.ROPE)
+            self._hand[rows, 0] = self.qpos[rows, :3]
+            self._palm[rows, 0] = self.qpos[rows, 3:7]
+        self._read = -1
         self.drives.rest(rows, self.angles)
-        self.held[rows], self._grip[rows] = hold, round(GRIP / STEP)
+        self._hold(rows, hold)
+        self._grip[rows] = round(GRIP / STEP)
         if self.imus is not None:
             self.imus.rest(rows, self.qpos, self.qvel)
+
+    def release(self, lane: int) -> None:
+        """Let go of a robot that is held."""
+        self._hold(np.array([lane]), Hold.NOT)
 
     def order(self, lane: int, joint: int, goal: float) -> None:
         """Give one servo a goal, ticks; it takes effect after the servo's latency."""
@@ -96,7 +124,9 @@ class Plant:
 
     def encoders(self) -> Array:
         """What the encoders say now, ticks, shape (n_lanes, n_joints)."""
-        return self.drives.read(self.angles)
+        if self._read != self.steps:
+            self._read, self._ticks = self.steps, self.drives.read(self.angles)
+        return self._ticks
 
     def step(self, count: int = 1) -> None:
         """Let some steps of time pass."""
@@ -109,21 +139,26 @@ class Plant:
             self.steps += 1
             if self.steps % HEAT == 0:
                 self.drives.heat(HEAT * STEP)
-            if self.held.any():
-                self._hold()
-            if self.imus is not None:
-                self.imus.sample(self.steps, self.qpos, self.qvel)
+            if self._by_hand:
+                self._feel()
+            if self.imus is not None and self.steps % EVERY == 0:
+                self.imus.sample(self.qpos, self.qvel)
 
-    def _hold(self) -> None:
-        """Hands that hold robots: all of a limp one, the torso of a stiff one."""
+    def _hold(self, rows: NDArray[np.intp], hold: Hold) -> None:
+        self.held[rows] = hold
+        if self.robot.floating:
+            self._welds[rows, 0] = float(hold is not Hold.NOT)
+        self._by_hand = bool((self.held == Hold.HAND).any())
+
+    def _feel(self) -> None:
+        """Hands keep all of a limp robot in place, and let go of one that is stiff."""
         power = self.drives.orders.power
-        for lane in np.flatnonzero(self.held):
+        for lane in np.flatnonzero(self.held == Hold.HAND):
             if not power[lane].any():
                 self.qpos[lane], self.qvel[lane] = self.start[lane], 0.0
-            elif self.robot.floating:
-                self.qpos[lane, :7], self.qvel[lane, :6] = self.start[lane, :7], 0.0
             self._grip[lane] -= int(power[lane].all())
-            self.held[lane] = self._grip[lane] > 0
+            if self._grip[lane] <= 0:
+                self.release(int(lane))
 
 
 def _stretch(addresses: list[int]) -> slice | list[int]:

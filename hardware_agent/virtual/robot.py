@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hardware_agent.virtual.bno055 import Bno055
 from hardware_agent.virtual.board import Board
 from hardware_agent.virtual.bus import Bus
-from hardware_agent.virtual.plant import Plant
+from hardware_agent.virtual.plant import Hold, Plant
 from hardware_agent.virtual.servo import Servo, Servo1, Servo2
 from hardware_agent.virtual.skeleton import STEP
 from pup.errors import InputError
@@ -31,7 +31,7 @@ class Pose:
       tilt: roll, pitch and yaw, Z-Y-X, rad, shape (3,).
       forward: way since the robot was put down, along where it looked then, m.
       left: the same to its left, m.
-      held: whether a hand holds it.
+      held: how it is held: "not", "hand" or "rope".
     """
 
     time: float
@@ -39,7 +39,7 @@ class Pose:
     tilt: tuple[float, ...]
     forward: float
     left: float
-    held: bool
+    held: str
 
 
 class VirtualRobot:
@@ -78,11 +78,11 @@ class VirtualRobot:
         """Simulated time, s."""
         return self.plant.time
 
-    def reset(self, hold: bool = True) -> None:
+    def reset(self, hold: Hold = Hold.HAND) -> None:
         """Put the robot down in its start pose, as a person would; servos stay as they are told.
 
         Args:
-          hold: whether the person holds it until all its servos have had torque for a moment.
+          hold: how it is held there.
         """
         self.plant.place([0], hold)
         _, _, yaw = _tilt(self.plant.qpos[0, 3:7])
@@ -91,12 +91,13 @@ class VirtualRobot:
 
     def release(self) -> None:
         """Let go."""
-        self.plant.held[0] = False
+        self.plant.release(0)
 
     def battery(self) -> None:
         """Put a fresh battery in."""
         drives = self.plant.drives
         drives.charge = drives.fresh.copy()
+        drives.refresh()
 
     def cool(self) -> None:
         """Wait until the motors are cold, without the time passing."""
@@ -127,22 +128,15 @@ class VirtualRobot:
             servo.watch(self.time)
 
     def pose(self) -> Pose:
-        """What a motion capture would see."""
+        """What a motion capture would see; of a bench, nothing but the time."""
+        held = Hold(self.plant.held[0]).name.lower()
         if not self.robot.floating:
-            nothing = (0.0, 0.0, 0.0)
-            return Pose(self.time, nothing, nothing, 0.0, 0.0, bool(self.plant.held[0]))
-        place = self.plant.qpos[0, :3]
-        x, y, yaw = self._put_down
-        way = np.array([place[0] - x, place[1] - y])
-        ahead = np.array([np.cos(yaw), np.sin(yaw)])
-        return Pose(
-            self.time,
-            tuple(map(float, place)),
-            _tilt(self.plant.qpos[0, 3:7]),
-            float(way @ ahead),
-            float(way @ np.array([-ahead[1], ahead[0]])),
-            bool(self.plant.held[0]),
-        )
+            return Pose(self.time, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0, held)
+        x, y, z = map(float, self.plant.qpos[0, :3])
+        x_then, y_then, yaw = self._put_down
+        way, ahead = np.array([x - x_then, y - y_then]), np.array([np.cos(yaw), np.sin(yaw)])
+        forward, left = float(way @ ahead), float(way @ np.array([-ahead[1], ahead[0]]))
+        return Pose(self.time, (x, y, z), _tilt(self.plant.qpos[0, 3:7]), forward, left, held)
 
 
 def _tilt(turn: Array) -> tuple[float, float, float]:

@@ -17,6 +17,7 @@ from typing import Any
 
 from hardware_agent.virtual.faults import Faults
 from hardware_agent.virtual.packets import BITS, Framer
+from hardware_agent.virtual.plant import Hold
 from hardware_agent.virtual.robot import VirtualRobot
 from hardware_agent.virtual.side import Side
 from hardware_agent.virtual.skeleton import STEP
@@ -203,7 +204,10 @@ class Server(AbstractContextManager["Server"]):
             self.link.plug()
 
     def _reset(self, told: Mapping[str, Any]) -> dict[str, Any]:
-        self.robot.reset(bool(told.get("hold", True)))
+        held = str(told.get("hold", "hand")).upper()
+        if held not in Hold.__members__:
+            raise InputError("reset: hold is hand, rope or not")
+        self.robot.reset(Hold[held])
         return asdict(self.robot.pose())
 
     def _release(self, told: Mapping[str, Any]) -> None:

@@ -53,7 +53,7 @@ class Servo(Device):
     @property
     def position(self) -> int:
         """That the encoder shows, ticks."""
-        return int(self.plant.drives.read(self.plant.angles)[self.at])
+        return int(self.plant.encoders()[self.at])
 
     @property
     def speed(self) -> float:
@@ -74,10 +74,8 @@ class Servo(Device):
 
     def alarms(self) -> int:
         """What is wrong with the servo."""
-        found = self.latched
-        unit = 0.1
-        low, high = self.memory.get("min_voltage"), self.memory.get("max_voltage")
-        if not low * unit <= self.volts <= high * unit:
+        found, decivolts = self.latched, 10 * self.volts
+        if not self.memory.get("min_voltage") <= decivolts <= self.memory.get("max_voltage"):
             found |= VOLTAGE
         if self.temperature > self.memory.get("temperature_limit"):
             found |= OVERHEATING
@@ -135,7 +133,7 @@ class Servo(Device):
         self.plant.order(*self.at, ticks)
 
     def _order(self, what: str, value: float) -> None:
-        getattr(self.plant.drives.orders, what)[self.at] = value
+        self.plant.drives.order(what, self.at, value)
 
 
 class Servo1(Servo):
@@ -235,9 +233,12 @@ class Servo2(Servo):
         """The EEPROM is locked while torque is on."""
         return bool(self.memory.get("torque_enable"))
 
-    def hear(self) -> None:
-        """The watchdog counts from here."""
-        self.heard = self.plant.time
+    def hears(self, protocol: int, baud: int | None) -> bool:
+        """As any device; the watchdog counts from here."""
+        heard = super().hears(protocol, baud)
+        if heard:
+            self.heard = self.plant.time
+        return heard
 
     def watch(self, now: float) -> None:
         """Stop where the bus has been silent for longer than the watchdog allows.
@@ -296,7 +297,7 @@ class Servo2(Servo):
         end = address + length
         if end <= self.DATA or address >= self.DATA + self.COUNT:
             return super().read(address, length)
-        self.memory.check(address, length)
+        self.memory.within(address, length)
         return b"".join(super(Servo2, self).read(self._real(a), 1) for a in range(address, end))
 
     def write(self, address: int, data: bytes) -> None:

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 STEP = 0.001  # s, of physics and firmware
 FLOOR = "floor"
+HAND = "hand"
 CLEAR = 0.0005  # m between soles and mat when a robot is put down
 
 
@@ -38,6 +39,8 @@ def build(robot: RobotDescription, character: Character) -> mujoco.MjModel:
         joint.armature, joint.damping, joint.frictionloss = rotor, (0, 0, 0), 0.0
     _weigh(spec, robot, character)
     _lay(spec, character)
+    if robot.floating:
+        _attach(spec, robot)
     try:
         return spec.compile()
     except ValueError as error:
@@ -67,6 +70,20 @@ def _lay(spec: mujoco.MjSpec, character: Character) -> None:
         floor.solref = (mat.time, mat.damping)
         floor.solimp = (0.85, 0.95, 0.004, 0.5, 2.0)
         floor.quat = (1.0, -mat.tilt[1] / 2, mat.tilt[0] / 2, 0.0)
+
+
+def _attach(spec: mujoco.MjSpec, robot: RobotDescription) -> None:
+    """A hand that can hold the torso, or a rope that it can hang on."""
+    spec.worldbody.add_body(name=HAND, mocap=True)
+    spec.add_equality(
+        name=HAND,
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=HAND,
+        name2=robot.torso,
+        active=False,
+        data=(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0),  # one pose, and turns count as much as ways
+    )
 
 
 def standing(robot: RobotDescription, model: mujoco.MjModel, pose: Array) -> Array:

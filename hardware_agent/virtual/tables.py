@@ -56,11 +56,6 @@ class ControlTable:
         """Registers by name."""
         return {register.name: register for register in self.registers}
 
-    def within(self, address: int, length: int) -> list[Register]:
-        """Registers of which a stretch of addresses has a byte."""
-        end = address + length
-        return [r for r in self.registers if r.address < end and address < r.end]
-
 
 def _eeprom(*rows: tuple[str, int, int, int, int, int]) -> tuple[Register, ...]:
     return tuple(Register(*row, lasting=True) for row in rows)
