@@ -23,6 +23,7 @@ from pup.diagnosis.fitting import (
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
+from pup.diagnosis.starts import ROUGHLY, joined, options, without_samples
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
 
@@ -34,12 +35,6 @@ WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
 FIRST, ROUGH = 2, 5
 """Steps after which finalists are compared for the first time, and in which they are."""
-ROUGHLY = 1e-3
-"""Relative gain of chi-squared at which a finalist's fit may end."""
-SHARES = (1.0, 0.4)
-"""Shares of its linear size at which a finalist may start."""
-DAMPED, FURTHEST = 0.01, 0.5
-"""Damping and reach of the step that the other coordinates may take with it."""
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
@@ -192,7 +187,7 @@ class Selector:
             rivals = [m for m in chosen[-1].finalists[1:] if m.hypotheses[-1].key not in known]
             for rival in rivals[:RIVALS]:
                 owners.append((chosen[-1], hypothesis, others))
-                fit = _joined(self._less(model, hypothesis), rival)
+                fit = joined(self._less(model, hypothesis), rival.fit, rival.hypotheses[-1])
                 tried.append(((*others, rival.hypotheses[-1]), fit))
         fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=ROUGH)
         chi2 = [fit.chi2 for _, fit in tried]
@@ -226,10 +221,10 @@ class Selector:
             return None
         shortlist = _shortlist(ranking, self.enough)
         tried = [self._started(model, score) for score in shortlist]
-        options = [
-            _options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
+        places = [
+            options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
         ]
-        start_best([f for _, f in tried], options, self.replays, self.noise)
+        start_best([f for _, f in tried], places, self.replays, self.noise)
         self._refit([fit for _, fit in tried], fit.chi2)
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
@@ -340,7 +335,7 @@ class Selector:
             return model
         measured = self.replays.measured
         insides = [measured.only(fold) for fold in self.folds]
-        fits = [_without_samples(model.fit, inside) for inside in insides]
+        fits = [without_samples(model.fit, inside) for inside in insides]
         fit_together(fits, self.replays, self.noise, iterations=ROUGH)
         rows = [[fit.row()] for fit in fits]
         told = self.replays.together(list(zip(rows, self.folds, strict=True)))
@@ -348,41 +343,6 @@ class Selector:
         for inside, simulated in zip(insides, told, strict=True):
             predicted[inside] = np.where(np.isnan(simulated[0]), LOST, simulated[0])
         return replace(model, predicted=predicted)
-
-
-def _options(before: Fit, score: Score, fit: Fit) -> list[Array]:
-    """Where a finalist may start: all or some of what slopes promise, with or without the others.
-
-    Many an effect acts from some size on, and then more than its slope says.
-    """
-    assert before.jacobian is not None and before.residual is not None
-    n, trace = len(before.at), score.trace.whole
-    sizes = fit.at[n : n + trace.shape[1]]
-    normal = before.jacobian.T @ before.jacobian
-    normal[np.diag_indices(n)] += 1 + DAMPED * np.diag(normal)
-    low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
-    options = []
-    for share in SHARES:
-        at = fit.at.copy()
-        at[n : n + len(sizes)] = share * sizes
-        left = before.jacobian.T @ (before.residual - trace @ (share * sizes))
-        step = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
-        options += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
-    return options
-
-
-def _joined(fit: Fit, rival: Model) -> Fit:
-    """A fit with the last effect of another model, as that found it."""
-    own = rival.hypotheses[-1]
-    names = {*own.magnitudes, *(name for name, _ in own.shape)}
-    kept = [i for i, c in enumerate(rival.fit.coordinates) if c.name in names]
-    return Fit(
-        fit.coordinates + tuple(rival.fit.coordinates[i] for i in kept),
-        np.r_[fit.at, rival.fit.at[kept]],
-        fixed={**fit.fixed, **{n: v for n, v in rival.fit.fixed.items() if n in names}},
-        thorough=False,
-        slack=ROUGHLY,
-    )
 
 
 def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
@@ -403,24 +363,6 @@ def _material(
     assert before.fit.residual is not None and after.fit.residual is not None
     explained = np.bincount(channel, before.fit.residual**2 - after.fit.residual**2)
     return bool((explained > MATERIAL**2 * np.bincount(channel)).any())
-
-
-def _without_samples(fit: Fit, inside: NDArray[np.bool_]) -> Fit:
-    """A fit to the other samples, which starts from one to all."""
-    assert fit.jacobian is not None and fit.residual is not None
-    weight = np.where(inside, 0.0, 1.0)
-    return Fit(
-        fit.coordinates,
-        fit.at,
-        fixed=fit.fixed,
-        weight=weight,
-        residual=fit.residual,
-        jacobian=fit.jacobian,
-        chi2=float((fit.residual * weight) @ fit.residual),
-        thorough=False,
-        age=1,
-        slack=ROUGHLY,
-    )
 
 
 def _left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:
