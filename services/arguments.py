@@ -49,6 +49,8 @@ def parser() -> argparse.ArgumentParser:
         ("record", "record scripted motions of a virtual robot", _record),
         ("presysid", "fit a robot's parameters to recordings, with bounds", _presysid),
         ("train", "train a policy that walks, within bounds; run again, it resumes", _train),
+        ("transfer", "find what walks furthest on a robot, by a running service", _transfer),
+        ("serve", "run the service that robots and studies talk to, or make its keys", _serve),
         ("replay", "simulate recordings and compare, or let a policy walk", _replay),
         ("diagnose", "say what physics the simulator leaves out, and model it", _diagnose),
         ("blind", "make, diagnose or score a sealed set of concealed cases", _blind),
@@ -139,6 +141,84 @@ def _train(verb: argparse.ArgumentParser) -> None:
         help="processes that simulate, lost ones are replaced; default: none beside the learner's",
     )
     cores(where)
+
+
+def _transfer(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--policy", type=Path, required=True, metavar="DIR", help="policy of `pup train`"
+    )
+    verb.add_argument(
+        "--study", required=True, metavar="NAME", help="made, or joined where it is there"
+    )
+    verb.add_argument(
+        "--out",
+        type=Path,
+        default=Path(),
+        metavar="DIR",
+        help="folder for study.json; default: the current one",
+    )
+    where = verb.add_argument_group("the service")
+    where.add_argument(
+        "--url", default="http://127.0.0.1:8470", help="of `pup serve`; default: %(default)s"
+    )
+    where.add_argument(
+        "--token-file", metavar="FILE", help="with an operator's token; default: PUP_TOKEN"
+    )
+    study = verb.add_argument_group("the study, where it is made; defaults are the service's")
+    for name, limits, kind, told in (
+        ("--trials", (1, 1000), int, "walks until eta is chosen (25)"),
+        ("--initial", (1, 1000), int, "uniform ones among them (5)"),
+        ("--repeats", (0, 100), int, "walks of the chosen eta, and of each compared one (5)"),
+        ("--horizon", (0.1, 600.0), float, "longest walk, s (15)"),
+        ("--lease", (1.0, 86400.0), float, "silence after which a trial is lost, s (120)"),
+        ("--failures", (1, 1000), int, "trials without a result until it pauses (1; --auto: 3)"),
+        ("--seed", (0, 2**31 - 1), int, "of everything random (0)"),
+    ):
+        study.add_argument(
+            name, type=number(*limits, kind), metavar="N" if kind is int else "X", help=told
+        )
+    study.add_argument("--agent", metavar="NAME", help="that shall run it; default: any that can")
+    study.add_argument(
+        "--auto", action="store_true", help="trials need no operator's release at the service"
+    )
+    study.add_argument(
+        "--compare",
+        type=numbers,
+        action="append",
+        default=[],
+        metavar="A,B,...",
+        help="an eta to compare with, such as that of the fitted parameters; may be repeated",
+    )
+    study.add_argument(
+        "--simulated", type=Path, metavar="FILE", help="rollouts in simulation to start from"
+    )
+    study.add_argument(
+        "--no-warm-start", action="store_true", help="keep them, but do not start from them"
+    )
+
+
+def _serve(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "action",
+        nargs="?",
+        choices=("run", "token", "revoke-token", "agent", "revoke-agent"),
+        default="run",
+        help="run the service; make or end a token, or the key of an agent; default: run",
+    )
+    verb.add_argument("who", nargs="?", metavar="NAME", help="of the token or agent")
+    verb.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="TOML; variables PUP_DATA, PUP_HOST, PUP_PORT, PUP_LINK, ... win over it",
+    )
+    verb.add_argument(
+        "--role",
+        choices=("viewer", "operator", "admin"),
+        default="viewer",
+        help="of the token; default: %(default)s",
+    )
+    verb.add_argument("--out", metavar="DIR", help="folder for the files that go to the robot")
 
 
 def _replay(verb: argparse.ArgumentParser) -> None:

@@ -110,6 +110,36 @@ def _train(options: argparse.Namespace) -> dict[str, Any]:
         return train(robot, options.bounds, wanted, out, lambda: places.training(options), told)
 
 
+def _transfer(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services import transfer
+
+    simulated = transfer.read_simulated(options.simulated) if options.simulated else None
+    wanted = transfer.Wanted(
+        options.policy,
+        options.study,
+        options.url,
+        transfer.token_of(options.token_file),
+        transfer.settings_of(options),
+        simulated,
+    )
+    with _folder(options.out) as out:
+        return transfer.transfer(wanted, out, lambda line: print(line, file=sys.stderr, flush=True))
+
+
+def _serve(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services.gateway import verb
+
+    return verb.serve(options)
+
+
+def _service() -> None:
+    wanted = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "botorch", "httpx")
+    if missing := [name for name in wanted if find_spec(name) is None]:
+        raise InputError(f"the service needs {missing[0]}; install pup[service]")
+
+
 def _replay(options: argparse.Namespace) -> dict[str, Any]:
     if bool(options.recordings) == bool(options.policy):
         raise InputError("give either recordings or --policy DIR")
@@ -281,6 +311,18 @@ def _show_training(shown: dict[str, Any]) -> None:
     training_table(shown)
 
 
+def _show_transfer(shown: dict[str, Any]) -> None:
+    from services.transfer import show
+
+    show(shown)
+
+
+def _show_service(shown: dict[str, Any]) -> None:
+    from services.gateway.verb import show
+
+    show(shown)
+
+
 def _show_replay(shown: dict[str, Any]) -> None:
     from services.tables import replay_table, walk_table
 
@@ -314,6 +356,8 @@ VERBS = {
     "record": (_record, _show_recordings),
     "presysid": (_presysid, _show_bounds),
     "train": (_train, _show_training),
+    "transfer": (_transfer, _show_transfer),
+    "serve": (_serve, _show_service),
     "replay": (_replay, _show_replay),
     "diagnose": (_diagnose, _show_diagnosis),
     "blind": (_blind, _show_blind),

@@ -106,7 +106,7 @@ class Conductor:
 
     async def run(self) -> None:
         """Go on until the process ends, or another gateway takes over."""
-        while True:
+        while self.stopped is None:
             self.tick()
             await asyncio.sleep(PERIOD)
 

@@ -1,0 +1,261 @@
+"""The job behind `pup transfer`: a study on a running gateway, followed to its end."""
+
+import hashlib
+import os
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from pup.errors import InputError
+from pup.files import read_json, write_json
+from pup.policy.bundle import CARD, NumpyPolicy
+from pup.transfer.study import Gate
+from services.gateway.keys import check_name
+
+SCHEMA = 1
+PERIOD = 1.0
+"""Between two looks at the study, s."""
+TIMEOUT = 30.0
+PATIENCE = 3600.0
+"""For a gateway that does not answer, once it has, s."""
+Told = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is asked of the gateway.
+
+    Attributes:
+      policy: folder of the bundle.
+      study: name.
+      url: of the gateway.
+      token: of an operator.
+      settings: of the study, where they differ from the defaults.
+      simulated: rollouts in simulation to start from, or None.
+    """
+
+    policy: Path
+    study: str
+    url: str
+    token: str
+    settings: dict[str, Any]
+    simulated: dict[str, Any] | None = None
+
+
+class Gateway:
+    """A gateway over HTTP; requests are repeated, with the same key, while it is away.
+
+    Args:
+      url: of the service.
+      token: bearer token.
+      told: hears why it waits.
+    """
+
+    def __init__(self, url: str, token: str, told: Told) -> None:
+        if not url.startswith(("http://", "https://")):
+            raise InputError(f"--url: {url[:60]!r} does not begin with http:// or https://")
+        headers = {"Authorization": f"Bearer {token}"}
+        self.url, self.told, self.met = url, told, False
+        try:
+            self.http = httpx.Client(base_url=url, headers=headers, timeout=TIMEOUT)
+        except (httpx.InvalidURL, ValueError, UnicodeEncodeError) as error:
+            raise InputError(f"--url or token: cannot be used ({error})") from error
+
+    def get(self, path: str, **query: Any) -> Any:
+        """The answer to a GET."""
+        return self._ask("GET", path, params=query)
+
+    def post(self, path: str, body: Any) -> Any:
+        """The answer to a POST, which is carried out once."""
+        return self._ask("POST", path, json=body, headers={"Idempotency-Key": uuid.uuid4().hex})
+
+    def all(self, path: str, of: str) -> list[Any]:
+        """All pages of a list."""
+        found, after = [], None
+        while True:
+            page = self.get(path, **({} if after is None else {"after": after}))
+            found += page[of]
+            if (after := page["next"]) is None:
+                return found
+
+    def _ask(self, method: str, path: str, **options: Any) -> Any:
+        began, pause = time.monotonic(), 0.25
+        while True:
+            try:
+                answer = self.http.request(method, path, **options)
+                if answer.status_code < 500:
+                    break
+                why = f"it answers {answer.status_code}"
+            except httpx.HTTPError as error:
+                why = str(error) or type(error).__name__
+            if not self.met or time.monotonic() - began > PATIENCE:
+                raise InputError(
+                    f"{self.url}: no gateway answers ({why}); start one with `pup serve`, or say "
+                    "where it is with --url"
+                )
+            self.told(f"the gateway does not answer ({why}); waiting")
+            time.sleep(pause)
+            pause = min(2 * pause, 5.0)
+        self.met = True
+        if answer.status_code >= 400:
+            raise InputError(f"{self.url}: {_detail(answer)}")
+        try:
+            return answer.json()
+        except ValueError as error:
+            raise InputError(f"{self.url}: not a gateway of pup; its answer is no JSON") from error
+
+
+def _detail(answer: httpx.Response) -> str:
+    try:
+        told = answer.json()
+        return str(told["detail"]) or str(told["title"])
+    except (ValueError, KeyError, TypeError):
+        return f"it answers {answer.status_code}"
+
+
+def token_of(given: str | None) -> str:
+    """The token: of the file named by the option, or of the environment.
+
+    Raises:
+      InputError: there is none.
+    """
+    if given:
+        try:
+            token = Path(given).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"--token-file: {given} cannot be read") from error
+    else:
+        token = os.environ.get("PUP_TOKEN", "").strip()
+    if not token or not token.isascii() or not token.isprintable():
+        raise InputError("no token; set PUP_TOKEN or give --token-file FILE")
+    return token
+
+
+def transfer(wanted: Wanted, out: Path, told: Told) -> dict[str, Any]:
+    """Make or join a study and follow it; write `study.json` as it goes on.
+
+    Args:
+      wanted: the study.
+      out: folder for the file.
+      told: hears how far it is.
+
+    Returns:
+      The document of `study.json`.
+
+    Raises:
+      InputError: the policy, the gateway or a setting cannot be used.
+    """
+    check_name(wanted.study)
+    policy = NumpyPolicy.load(wanted.policy)
+    card = policy.card
+    digest = hashlib.sha256((wanted.policy / CARD).read_bytes()).hexdigest()
+    gateway = Gateway(wanted.url, wanted.token, told)
+    asked = {
+        "name": wanted.study,
+        "robot": card.robot,
+        "policy": digest,
+        "lower": list(card.eta_lower),
+        "upper": list(card.eta_upper),
+    }
+    if wanted.simulated is not None:
+        asked["simulated"] = wanted.simulated
+    study = gateway.post("/v1/studies", asked | wanted.settings)
+    told(f"{wanted.url}/studies/{study['name']}")
+    place, last = f"/v1/studies/{study['name']}", ""
+    while True:
+        study = gateway.get(place)
+        if (line := _line(study)) != last:
+            told(line)
+            last = line
+            document = _document(gateway, study)
+            write_json(out / "study.json", document)
+        if study["state"] == "done":
+            return document
+        time.sleep(PERIOD)
+
+
+def read_simulated(file: Path) -> dict[str, Any]:
+    """Simulated rollouts from a JSON file: `{"schema": 1, "eta": [...], "distance": [[...], ...]}`.
+
+    Raises:
+      InputError: it is none.
+    """
+    told = read_json(file)
+    if not isinstance(told, dict) or told.get("schema") != SCHEMA:
+        raise InputError(f"{file}: not simulated rollouts of schema {SCHEMA}")
+    if not isinstance(told.get("eta"), list) or not isinstance(told.get("distance"), list):
+        raise InputError(f"{file}: needs the lists eta and distance")
+    return {"eta": told["eta"], "distance": told["distance"]}
+
+
+def settings_of(options: Any) -> dict[str, Any]:
+    """Settings of a study from the command line; what was not given is the gateway's default."""
+    names = ("trials", "initial", "repeats", "horizon", "lease", "failures", "agent", "seed")
+    told = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    told["gate"] = (Gate.AUTO if options.auto else Gate.OPERATOR).value
+    if options.auto:
+        told.setdefault("failures", 3)
+    told["compare"] = [list(eta) for eta in options.compare]
+    told["warm_start"] = not options.no_warm_start
+    return told
+
+
+def _line(study: dict[str, Any]) -> str:
+    wanted, farthest = study["settings"]["trials"], study["farthest"]
+    line = f"{study['name']}: {study['state']}, {study['walks']}/{wanted} walks"
+    if farthest is not None:
+        line += f", farthest {farthest:.3f} m"
+    if study["open"] is not None:
+        line += f"; trial {study['open']}"
+    why = study["reason"] or study["waits_for"]
+    return f"{line}; waits for {why}" if study["waits_for"] else f"{line}; {why}" if why else line
+
+
+def _document(gateway: Gateway, study: dict[str, Any]) -> dict[str, Any]:
+    place = f"/v1/studies/{study['name']}"
+    trials = gateway.all(f"{place}/trials", "trials")
+    history = gateway.all(f"{place}/history", "events")
+    return {
+        "schema": SCHEMA,
+        "study": study["name"],
+        "state": study["state"],
+        "robot": study["settings"]["robot"],
+        "policy": study["settings"]["policy"],
+        "eta": study["chosen"],
+        "settings": study["settings"],
+        "evaluation": _evaluation(study, trials),
+        "posterior": gateway.get(f"{place}/posterior"),
+        "trials": trials,
+        "history": history,
+    }
+
+
+def _evaluation(study: dict[str, Any], trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Distances of the chosen eta and of those compared with it, walked after the choice."""
+    told = []
+    for purpose, eta in [("repeat", study["chosen"])] + [
+        ("compare", eta) for eta in study["settings"]["compare"]
+    ]:
+        walked = [
+            t["distance"]
+            for t in trials
+            if (t["purpose"], t["eta"], t["state"]) == (purpose, eta, "succeeded")
+        ]
+        if walked:
+            mean = sum(walked) / len(walked)
+            told.append({"purpose": purpose, "eta": eta, "distance": walked, "mean": mean})
+    return told
+
+
+def show(shown: dict[str, Any]) -> None:
+    """Print the outcome for people."""
+    eta = ", ".join(f"{x:+.3f}" for x in shown["eta"] or ())
+    print(f"eta: {eta}")
+    for part in shown["evaluation"]:
+        walks = " ".join(f"{d:.3f}" for d in part["distance"])
+        print(f"{part['purpose']}: {part['mean']:.3f} m ({walks})")
