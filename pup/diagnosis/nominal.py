@@ -37,7 +37,7 @@ than noise: where much is missing, a fit has many ends that lack it all the same
 EXCESS = 0.03
 ABSOLUTE = 5.0
 SPARE = 0.02
-"""A fit that leaves no more than noise, and this share of it, has not stopped short."""
+"""Share of the noise that may be left by a fit that has stopped short."""
 ROUGH = 2e-3
 """Relative gain of chi-squared at which the starts may end: all that follows is the noise floor."""
 WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
@@ -57,16 +57,22 @@ class Certificate:
       starts: chi-squared that the two best starts lead to.
       agree: whether they agree.
       recovered: largest error of a refit of its own simulation, in standard deviations.
+      left: chi-squared by which that refit stops short, and starts that fit to the noise: contact
+        has kinks on which a fit gets caught. What gains no more is no evidence.
+      samples: number of samples.
     """
 
     starts: tuple[float, ...]
     agree: bool
     recovered: float
+    left: float = 0.0
+    samples: int = 0
 
     @property
     def holds(self) -> bool:
         """Whether a verdict may be given."""
-        return self.agree and self.recovered <= SELF
+        found_again = self.recovered <= SELF or self.left < SPARE * self.samples
+        return self.agree and found_again
 
 
 @dataclass(frozen=True)
@@ -127,8 +133,11 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     best, second = sorted(fits, key=lambda fit: fit.chi2)
     if best.jacobian is None:
         differentiate([best], replays, noise)
-    own = _refit_of_itself(best, replays, noise, rng)
-    return Nominal(best, noise, Certificate((best.chi2, second.chi2), agreed, own))
+    recovered, left = _refit_of_itself(best, replays, noise, rng)
+    if _noise_like(best):
+        left = max(left, second.chi2 - best.chi2)
+    starts, samples = (best.chi2, second.chi2), len(measured.values)
+    return Nominal(best, noise, Certificate(starts, agreed, recovered, left, samples))
 
 
 def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
@@ -170,9 +179,15 @@ def _agree(first: Fit, second: Fit) -> bool:
     assert first.residual is not None
     least, apart = min(first.chi2, second.chi2), abs(first.chi2 - second.chi2)
     excess = least - len(first.residual)
-    if excess <= SPARE * len(first.residual):
+    if _noise_like(first) or _noise_like(second):
         return True
     return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE)
+
+
+def _noise_like(fit: Fit) -> bool:
+    """Whether a fit leaves no more than noise: then it has not stopped short by much."""
+    assert fit.residual is not None
+    return fit.chi2 <= (1 + SPARE) * len(fit.residual)
 
 
 def _start(
@@ -200,18 +215,20 @@ def _within(coordinates: Sequence[Coordinate], at: Array) -> Array:
     return np.clip(at, low, high)
 
 
-def _refit_of_itself(fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator) -> float:
-    """How far a fit of its own simulation ends from it, in standard deviations."""
+def _refit_of_itself(
+    fit: Fit, replays: Replays, noise: Noise, rng: np.random.Generator
+) -> tuple[float, float]:
+    """How far a fit of its own simulation ends from it: standard deviations, and chi-squared."""
     # What the model leaves counts as noise here too: nothing is known better than that.
     misfit = max(1.0, fit.chi2 / len(replays.measured.values))
     deviation = np.sqrt(misfit * np.diag(fit.covariance()))
-    simulated, off = replays([fit.row()])[0], np.inf
+    simulated, ends = replays([fit.row()])[0], []
     for _ in range(SELVES):  # a kink on the way says nothing of where the way leads
         away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
         start = _within(fit.coordinates, fit.at + away)
         own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1)
         fit_together([own], replays, noise, iterations=8)
-        off = min(off, float(np.max(np.abs(own.at - fit.at) / deviation)))
-        if off <= SELF:
+        ends.append((float(np.max(np.abs(own.at - fit.at) / deviation)), own.chi2))
+        if ends[-1][0] <= SELF or own.chi2 < SPARE * len(simulated):
             break
-    return off
+    return min(ends)

@@ -42,10 +42,11 @@ def pieces(recordings: Sequence[Recording]) -> list[Recording]:
 def _wakes(recording: Recording) -> NDArray[np.bool_]:
     """The last tick of each rest."""
     moving = np.zeros(len(recording.time), bool)
-    before = np.searchsorted(recording.time, recording.time - STILL)
-    for values in (recording.target, recording.position):
-        small = SMALL * (np.nanmax(recording.target, axis=0) - np.nanmin(recording.target, axis=0))
-        moving |= (np.abs(values - values[before]) > small).any(axis=1)
+    small = SMALL * (np.nanmax(recording.target, axis=0) - np.nanmin(recording.target, axis=0))
+    for ago in (STILL, STILL / 2):  # at a turn, values of a while ago are the same again
+        before = np.searchsorted(recording.time, recording.time - ago)
+        for values in (recording.target, recording.position):
+            moving |= (np.abs(values - values[before]) > small).any(axis=1)
     resting = ~moving & (recording.time - recording.time[0] >= STILL)
     return np.asarray(resting & np.append(moving[1:], False))
 

@@ -72,7 +72,7 @@ def search(
     found = traces(hypotheses(replays.measured), base, replays, nominal.noise)
     if not found:
         return None
-    enough = threshold(found, rng, FALSE_ALARMS)
+    enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
     selector = Selector(replays, nominal.noise, found, enough, nominal.fit)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()

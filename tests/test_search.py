@@ -1,0 +1,102 @@
+"""What is searched, and in which order: parts of one recording, motions that get lost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pup.diagnosis.fitting import Fit, nominal_coordinate
+from pup.diagnosis.nominal import Certificate, Nominal
+from pup.diagnosis.pieces import SHORTEST, STILL, pieces
+from pup.diagnosis.replays import Bench, Replays, threads
+from pup.diagnosis.residuals import Measured, assumed_noise
+from pup.diagnosis.search import followed
+from pup.physics.parameters import robot_space
+from pup.recording import Recording
+from tests.diagnosis_cases import BENCH, recordings
+
+
+def moves(rests: list[float], period: float = 0.02) -> Recording:
+    """A servo that moves for a second, to and fro, and rests as long as is given, and so on."""
+    parts = [np.zeros(round(0.5 / period))]
+    for number, rest in enumerate(rests):
+        ramp = np.linspace(0.0, 1.0, round(1 / period))
+        start, end = number % 2, (number + 1) % 2
+        parts += [start + (end - start) * ramp, np.full(round(rest / period), float(end))]
+    target = np.concatenate(parts)[:, None]
+    return replace(
+        recordings({})[0],
+        id="long",
+        time=3.0 + period * np.arange(len(target)),
+        target=target,
+        position=target + 1e-4,
+    )
+
+
+class TestPieces:
+    @settings(max_examples=25, deadline=None)
+    @given(st.lists(st.floats(0.1, 3.0), min_size=6, max_size=30))
+    def test_nothing_is_lost_and_parts_start_at_rest(self, rests: list[float]) -> None:
+        whole = moves(rests)
+        parts = pieces([whole])
+        assert np.array_equal(np.concatenate([p.position for p in parts]), whole.position)
+        for part in parts[1:]:
+            assert part.time[-1] >= SHORTEST - 0.1
+            first = part.target[part.time <= 0.04]
+            assert np.ptp(first) < 0.05
+
+    def test_parts_are_cut_where_it_rests(self) -> None:
+        whole = moves([1.5] * 4)
+        parts = pieces([whole])
+        assert len(parts) == 4
+        assert [p.motion for p in parts] == [whole.motion] * 4
+        for part in parts:
+            resting = np.ptp(part.target[part.time[-1] - part.time < STILL])
+            assert resting == 0
+
+    def test_what_never_rests_or_is_short_stays_whole(self) -> None:
+        (short,) = pieces([moves([1.5])])
+        assert short.id == "long"
+        whole = moves([0.1] * 20)
+        wave = 0.5 * np.sin(5 * whole.time)[:, None]
+        (restless,) = pieces([replace(whole, target=wave, position=wave)])
+        assert restless.id == "long"
+
+    def test_several_recordings_stay_as_they_are(self) -> None:
+        two = [moves([1.5] * 4), moves([1.0] * 6)]
+        assert pieces(two) == two
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[Recording, ...]:
+    return recordings({})
+
+
+def kept(runs: tuple[Recording, ...]) -> list[int]:
+    """The recordings that the bench's nominal model follows."""
+    measured = Measured.of(BENCH, runs)
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    space = replays.space
+    coordinates = tuple(nominal_coordinate(space, name) for name in space.names)
+    fit = Fit(
+        coordinates,
+        np.array([c.coordinate(x) for c, x in zip(coordinates, space.nominal, strict=True)]),
+    )
+    nominal = Nominal(fit, assumed_noise(measured), Certificate((1.0, 1.0), True, 0.0))
+    return followed(nominal, replays)
+
+
+def test_where_all_are_followed_none_is_left_for_later(runs: tuple[Recording, ...]) -> None:
+    assert kept(runs) == []
+
+
+def test_a_motion_that_gets_lost_comes_second(runs: tuple[Recording, ...]) -> None:
+    astray = replace(runs[-1], position=runs[-1].position + 1.0)
+    assert kept((*runs[:-1], astray)) == [0, 1, 2, 3]
+
+
+def test_where_too_few_are_left_all_are_taken(runs: tuple[Recording, ...]) -> None:
+    lost = [replace(run, position=run.position + 1.0) for run in runs[2:]]
+    assert kept((*runs[:2], *lost)) == []
