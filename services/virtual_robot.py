@@ -1,5 +1,7 @@
 """The job behind `pup virtual-robot`: a robot that is not there, on pseudo-terminals."""
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +35,7 @@ class Wanted:
         return cls(ports=Ports(link, imu, side), **others)
 
 
-def serve(robot: RobotDescription, wanted: Wanted, ready: Any) -> dict[str, Any]:
+def serve(robot: RobotDescription, wanted: Wanted, ready: Callable[[str], None]) -> dict[str, Any]:
     """Let the robot live until the process is stopped.
 
     Args:
@@ -49,11 +51,8 @@ def serve(robot: RobotDescription, wanted: Wanted, ready: Any) -> dict[str, Any]
     """
     body = VirtualRobot(robot, wanted.seed, wanted.protocol)
     ports = wanted.ports
-    with Server(body, ports, wanted.speed, wanted.period) as server:
+    with suppress(KeyboardInterrupt), Server(body, ports, wanted.speed, wanted.period) as server:
         pace = f"{wanted.speed:g} x real time" if wanted.speed else "lock-step"
         ready(f"{robot.name}: bus {ports.link}, imu {ports.imu}, side {ports.side}; {pace}")
-        try:
-            server.run()
-        except KeyboardInterrupt:
-            return {"robot": robot.name, "seed": wanted.seed, "time": body.time}
-    raise AssertionError("a server runs until it is stopped")
+        server.run()
+    return {"robot": robot.name, "seed": wanted.seed, "time": body.time}

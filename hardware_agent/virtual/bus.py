@@ -39,7 +39,7 @@ class Bus:
 
     def __init__(self, devices: Sequence[Device]) -> None:
         self.devices = tuple(devices)
-        self._single: dict[int, Callable[[Packet, Device], bytes]] = {
+        both = {
             PING: _ping,
             READ: _read,
             WRITE: _write,
@@ -47,6 +47,10 @@ class Bus:
             ACTION: _act,
             FACTORY_RESET: _reset,
         }
+        self._single: dict[tuple[int, int], Callable[[Packet, Device], bytes]] = {
+            (protocol, instruction): do for protocol in (1, 2) for instruction, do in both.items()
+        }
+        self._single[2, REBOOT] = _reboot
 
     def handle(self, packet: Packet, baud: int | None = None) -> list[Reply]:
         """Do what a packet says.
@@ -81,20 +85,21 @@ class Bus:
             level = device.memory.get("status_return_level")
             needed = {PING: ONLY_PING, READ: ONLY_READ}.get(packet.instruction, ALL)
             silent = level < needed
+        id = device.id  # a new id or delay counts from the next packet on
+        fault, data = 0, b""
         try:
-            if not packet.sound:
-                raise RefusedError(Fault.CHECKSUM)
-            if packet.instruction == REBOOT and packet.protocol == 2:
-                reply = _reply(device, 0)
-                device.restart()
-                return None if silent else reply
-            do = self._single.get(packet.instruction)
-            if do is None:
-                raise RefusedError(Fault.INSTRUCTION)
-            reply = _reply(device, 0, do(packet, device))
+            data = self._do(packet, device)
         except RefusedError as refused:
-            reply = _reply(device, refused.fault.code(device.protocol))
-        return None if silent else reply
+            fault = refused.fault.code(device.protocol)
+        return None if silent else _reply(device, id, fault, data)
+
+    def _do(self, packet: Packet, device: Device) -> bytes:
+        if not packet.sound:
+            raise RefusedError(Fault.CHECKSUM)
+        do = self._single.get((packet.protocol, packet.instruction))
+        if do is None:
+            raise RefusedError(Fault.INSTRUCTION)
+        return do(packet, device)
 
     def _read_in_turn(self, packet: Packet, hearing: list[Device]) -> list[Reply]:
         if not packet.sound or packet.id != BROADCAST:
@@ -106,9 +111,9 @@ class Bus:
             if device is None or device.memory.get("status_return_level") < ONLY_READ:
                 break
             try:
-                replies.append(_reply(device, 0, device.read(address, length)))
+                replies.append(_reply(device, id, 0, device.read(address, length)))
             except RefusedError as refused:
-                replies.append(_reply(device, refused.fault.code(device.protocol)))
+                replies.append(_reply(device, id, refused.fault.code(device.protocol)))
         return replies
 
     def _write_together(self, packet: Packet, hearing: list[Device]) -> None:
@@ -123,10 +128,10 @@ class Bus:
                     continue  # nobody is told of it
 
 
-def _reply(device: Device, fault: int, data: bytes = b"") -> Reply:
+def _reply(device: Device, id: int, fault: int, data: bytes = b"") -> Reply:
     alarms = device.alarms()
     error = fault | (alarms if device.protocol == 1 else ALERT * bool(alarms))
-    return Reply(device.delay, status(device.protocol, device.id, error, data))
+    return Reply(device.delay, status(device.protocol, id, error, data))
 
 
 def _ping(packet: Packet, device: Device) -> bytes:
@@ -155,6 +160,11 @@ def _keep(packet: Packet, device: Device) -> bytes:
 
 def _act(packet: Packet, device: Device) -> bytes:
     device.act()
+    return b""
+
+
+def _reboot(packet: Packet, device: Device) -> bytes:
+    device.restart()
     return b""
 
 

@@ -200,7 +200,7 @@ def _motors(rng: np.random.Generator, joints: int) -> Motors:
         viscous=rng.uniform(0.0, 0.04),
         give=rng.uniform(0.001, 0.003),
         rotor=spread(0.0018, 0.12, 0.02),
-        play=spread(np.radians(0.33) / 2, 0.3, 0.3),
+        play=spread(np.radians(0.33) / 2, 0.2, 0.2),
         bias=rng.normal(0.0, 0.008, joints),
         latency=rng.uniform(0.001, 0.008),
         warmth=rng.uniform(5.0, 9.0),

@@ -4,6 +4,7 @@ from hardware_agent.virtual.memory import Fault, Memory, RefusedError
 from hardware_agent.virtual.tables import ControlTable, Register
 
 RETURN_DELAY = 2e-6  # s per count of the return delay
+SLACK = 0.03  # by which a UART's rate may be off
 
 
 class Device:
@@ -66,7 +67,7 @@ class Device:
           baud: at which it was sent; None suits all.
         """
         heard = self.alive and self.powered and self.protocol == protocol
-        return heard and baud in (None, self.baud)
+        return heard and (baud is None or abs(baud - self.baud) <= SLACK * self.baud)
 
     def permit(self, register: Register, value: int) -> None:
         """Refuse a value for other reasons than its range.

@@ -20,14 +20,15 @@ from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 HEIGHT = 0.5  # m by which a robot hangs higher than it stands
-GRIP = 0.5  # s for which a hand still holds a robot whose servos have all got torque
+STILL = 0.3  # rad/s below which all joints count as still
+GRIP, TIRED = 0.5, 2.0  # s of a stiff and still robot, and of a stiff one, until a hand lets go
 
 
 class Hold(IntEnum):
     """How a robot is held.
 
     NOT: it stands or lies by itself.
-    HAND: a hand keeps it in its start pose until all servos have had torque for a moment.
+    HAND: a hand keeps it in its start pose until it has been stiff and still for a moment.
     ROPE: it hangs in the air by its torso.
     """
 
@@ -66,7 +67,7 @@ class Plant:
         self.steps = 0
         self.ordered = 0  # goals ever given
         self.held = np.full(len(models), Hold.NOT)
-        self._grip = np.zeros(len(models), dtype=int)
+        self._stiff, self._still = np.zeros((2, len(models)))
         self._late: deque[tuple[int, int, int, float]] = deque()
         self.place(range(len(models)))
 
@@ -108,7 +109,7 @@ class Plant:
         self._read = -1
         self.drives.rest(rows, self.angles)
         self._hold(rows, hold)
-        self._grip[rows] = round(GRIP / STEP)
+        self._stiff[rows] = self._still[rows] = 0.0
         if self.imus is not None:
             self.imus.rest(rows, self.qpos, self.qvel)
 
@@ -156,8 +157,11 @@ class Plant:
         for lane in np.flatnonzero(self.held == Hold.HAND):
             if not power[lane].any():
                 self.qpos[lane], self.qvel[lane] = self.start[lane], 0.0
-            self._grip[lane] -= int(power[lane].all())
-            if self._grip[lane] <= 0:
+            if power[lane].all():
+                still = np.abs(self.speeds[lane]).max() < STILL
+                self._stiff[lane] += STEP
+                self._still[lane] = self._still[lane] + STEP if still else 0.0
+            if self._still[lane] > GRIP or self._stiff[lane] > TIRED:
                 self.release(int(lane))
 
 

@@ -85,9 +85,9 @@ class VirtualRobot:
           hold: how it is held there.
         """
         self.plant.place([0], hold)
-        _, _, yaw = _tilt(self.plant.qpos[0, 3:7])
-        x, y = self.plant.qpos[0, :2] if self.robot.floating else (0.0, 0.0)
-        self._put_down = float(x), float(y), yaw
+        if self.robot.floating:
+            x, y, *_ = map(float, self.plant.qpos[0, :2])
+            self._put_down = x, y, _tilt(self.plant.qpos[0, 3:7])[2]
 
     def release(self) -> None:
         """Let go."""
