@@ -1,110 +1,110 @@
-"""The other end of an agent's link: a gateway that hands out trials, for tests."""
+"""Gateways for tests: a real `pup serve` in a process of its own, on free ports."""
 
-import threading
+import os
+import signal
+import socket
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import zmq
-import zmq.auth
-from zmq.auth.thread import ThreadAuthenticator
+import httpx
 
-from pup.wire import Acknowledge, Assign, Body, Finished, Message, decode, encode
+from services.gateway.keys import KeyRing, Role, Tokens
 
-T = TypeVar("T")
+STUDY = {"robot": "darwin_op2", "policy": "a" * 64, "gate": "auto"}
 
 
-class Gateway:
-    """A ROUTER with CURVE that keeps what it is told.
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
-    Args:
-      folder: for the keys.
-      acknowledges: whether ends of trials are acknowledged.
-      port: to bind; 0 for any.
-    """
 
-    def __init__(self, folder: Path, acknowledges: bool = True, port: int = 0) -> None:
-        self.folder, self.acknowledges = folder, acknowledges
-        self.told: list[Message] = []
-        self.context = zmq.Context()
-        self._authenticator = ThreadAuthenticator(self.context)
-        self._authenticator.start()
-        keys(folder)
-        self._authenticator.configure_curve(domain="robots", location=str(folder / "known"))
-        self._socket = self.context.socket(zmq.ROUTER)
-        public, secret = zmq.auth.load_certificate(folder / "gateway.key_secret")
-        self._socket.curve_publickey, self._socket.curve_secretkey = public, secret
-        self._socket.curve_server = True
-        self._socket.setsockopt_string(zmq.ZAP_DOMAIN, "robots")
-        self._socket.setsockopt(zmq.LINGER, 0)
-        if port:
-            self._socket.bind(f"tcp://127.0.0.1:{port}")
-        self.port = port or self._socket.bind_to_random_port("tcp://127.0.0.1")
-        self._peer: bytes | None = None
-        self._lock = threading.Lock()
-        self._ending = False
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
+@dataclass
+class Service:
+    """A gateway's folder, ports and tokens; the process is started and killed by the tests."""
+
+    data: Path
+    port: int
+    link_port: int
+    tokens: dict[str, str]
+    database: str = ""
+    process: subprocess.Popen[bytes] | None = None
+
+    @classmethod
+    def make(cls, data: Path, database: str = "") -> "Service":
+        known = Tokens(data / "tokens.json")
+        tokens = {role.name.lower(): known.create(role.name.lower(), role) for role in Role}
+        return cls(data, free_port(), free_port(), tokens, database)
 
     @property
-    def config(self) -> str:
-        """For the agent."""
-        return (
-            f'[link]\ngateway = "tcp://127.0.0.1:{self.port}"\nheartbeat = 0.2\n'
-            f'key = "{self.folder}/agent.key_secret"\ngateway_key = "{self.folder}/gateway.key"\n'
-        )
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
 
-    def send(self, body: Body) -> None:
-        assert self._peer is not None
-        with self._lock:
-            self._socket.send_multipart([self._peer, encode(Message(body))])
+    @property
+    def link(self) -> str:
+        return f"tcp://127.0.0.1:{self.link_port}"
 
-    def of(self, kind: type[T]) -> list[T]:
-        """Bodies of a kind, in the order they came."""
-        return [m.body for m in list(self.told) if isinstance(m.body, kind)]
+    def agent_keys(self, name: str) -> tuple[Path, Path]:
+        out = self.data.parent / f"robot-{name}"
+        return KeyRing(self.data / "curve").create_agent(name, out)
 
-    def wait(self, kind: type[T], seconds: float = 30.0, told: Callable[[], Any] = str) -> T:
-        """The next of a kind that comes."""
-        before, deadline = len(self.of(kind)), time.monotonic() + seconds
-        while len(self.of(kind)) == before:
-            assert time.monotonic() < deadline, f"no {kind.__name__}: {self.told[-3:]} {told()}"
-            time.sleep(0.01)
-        return self.of(kind)[before]
+    def start(self) -> None:
+        told = {"DATA": self.data, "PORT": self.port, "LINK": self.link, "DATABASE": self.database}
+        environment = os.environ | {f"PUP_{k}": str(v) for k, v in told.items() if v}
+        with open(self.data / "log.jsonl", "ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "services.cli", "serve"], env=environment, stderr=log
+            )
+        for _ in range(600):
+            try:
+                if httpx.get(f"{self.url}/readyz").status_code == 200:
+                    return
+            except httpx.HTTPError:
+                pass
+            if self.process.poll() is not None:
+                raise AssertionError(f"the gateway ended: {(self.data / 'log.jsonl').read_text()}")
+            time.sleep(0.05)
+        raise AssertionError("the gateway does not start")
 
-    def run(self, assign: Assign, seconds: float = 60.0, told: Callable[[], Any] = str) -> Finished:
-        """Hand a trial out and wait for its end."""
-        self.send(assign)
-        return self.wait(Finished, seconds, told)
+    def kill(self, number: int = signal.SIGKILL) -> int:
+        assert self.process is not None
+        self.process.send_signal(number)
+        return self.process.wait(20)
 
-    def close(self) -> None:
-        self._ending = True
-        self._thread.join()
-        self._socket.close()
-        self._authenticator.stop()
-        self.context.term()
+    def client(self, role: str = "operator") -> httpx.Client:
+        headers = {"Authorization": f"Bearer {self.tokens[role]}"}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=30)
 
-    def _serve(self) -> None:
-        while not self._ending:
-            if not self._socket.poll(20):
-                continue
-            with self._lock:
-                peer, data = self._socket.recv_multipart()
-            self._peer = peer
-            message = decode(data)
-            self.told.append(message)
-            body = message.body
-            if isinstance(body, Finished) and self.acknowledges:
-                self.send(Acknowledge(message.id, body.trial, body.attempt, body.fence))
-            else:
-                self.send(Acknowledge(message.id))
+    def trials(self, study: str) -> list[dict[str, Any]]:
+        with self.client() as http:
+            return http.get(f"/v1/studies/{study}/trials").json()["trials"]
+
+    def wait_for(self, study: str, state: str = "done", seconds: float = 120) -> dict[str, Any]:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            try:
+                with self.client() as http:
+                    told = http.get(f"/v1/studies/{study}").json()
+                if told["state"] == state:
+                    return told
+            except httpx.HTTPError:
+                pass
+            time.sleep(0.1)
+        raise AssertionError(f"{study} is not {state}: {told}")
 
 
-def keys(folder: Path) -> None:
-    """Keys of both ends, and the folder of those that the gateway knows."""
-    if (folder / "gateway.key").exists():
-        return
-    (folder / "known").mkdir(parents=True)
-    for name in ("gateway", "agent", "stranger"):
-        zmq.auth.create_certificates(folder, name)
-    (folder / "known" / "agent.key").write_text((folder / "agent.key").read_text())
+@contextmanager
+def running(data: Path, **options: Any) -> Iterator[Service]:
+    service = Service.make(data, **options)
+    service.start()
+    try:
+        yield service
+    finally:
+        if service.process and service.process.poll() is None:
+            service.kill()

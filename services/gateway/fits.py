@@ -42,6 +42,10 @@ class Fits:
                     raise
         raise AssertionError
 
+    async def warm_up(self) -> None:
+        """Import what fits need before somebody waits for it."""
+        await self.run(_imported)
+
     def close(self) -> None:
         """End the process, whatever it is at."""
         children = list((self._pool._processes or {}).values())
@@ -61,6 +65,10 @@ def _one_thread() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the gateway ends it
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
+
+
+def _imported() -> None:
+    import pup.transfer.optimizer  # noqa: F401
 
 
 def search_of(study: Study, simulated: Row | None) -> Any:

@@ -111,6 +111,7 @@ async def _until_stopped(
             ("web", server.serve),
         )
     ]
+    warm = asyncio.create_task(conductor.fits.warm_up())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, server.stop)
@@ -119,9 +120,9 @@ async def _until_stopped(
     server.stop()
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(asyncio.shield(works[-1]), 2 * GRACE)
-    for work in works:
+    for work in (*works, warm):
         work.cancel()
-    await asyncio.gather(*works, return_exceptions=True)
+    await asyncio.gather(*works, warm, return_exceptions=True)
     for work in done:
         if not work.cancelled() and (error := work.exception()):
             raise error

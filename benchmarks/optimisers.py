@@ -1,0 +1,189 @@
+"""Regret of the optimiser of eta against Ax, Optuna's GP sampler and nevergrad's CMA.
+
+Every optimiser walks the same robots: landscapes with a ridge, lower hills, a cliff and noise that
+grows with distance (tests/landscapes.py), or recorded ones from a file. After 10 and after 25 walks
+each names the eta it would keep, by the means that it has for that; regret is what that eta's
+expected distance falls short of the best one's, in percent of it.
+
+    python -m benchmarks.optimisers --robots 20 --out optimisers.json
+"""
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+import landscapes
+
+Array = NDArray[np.float64]
+Session = Iterator[tuple[Array, Array | None]]
+"""Gives an eta to walk and the one it would keep by now; is sent the distance."""
+LOOKS = (10, 25)
+
+
+def ours(seed: int, simulated: Any = None) -> Session:
+    from pup.transfer.optimizer import Search, choose, suggest
+
+    def search(eta: Array, distance: Array) -> Search:
+        return Search((-1.0,) * 3, (1.0,) * 3, 5, seed, eta, distance, simulated)
+
+    eta, distance = np.zeros((0, 3)), np.zeros(0)
+    number = 0
+    while True:
+        number += 1
+        asked = np.array(suggest(search(eta, distance), number).eta)
+        kept = np.array(choose(search(eta, distance)).eta) if number - 1 in LOOKS else None
+        walked = yield asked, kept
+        eta, distance = np.vstack([eta, asked]), np.append(distance, walked)
+
+
+def warm(seed: int) -> Session:
+    return ours(seed, simulated())
+
+
+def simulated() -> Any:
+    """Rollouts in simulation of other robots of the family, one of each at each eta."""
+    from pup.transfer.surrogate import Simulated
+
+    rng = np.random.default_rng(99)
+    eta = rng.uniform(-1, 1, (64, 3))
+    made = [landscapes.Robot.draw(10_000 + i).walk(eta, rng) for i in range(48)]
+    return Simulated(eta, np.array(made))
+
+
+def cma(seed: int) -> Session:
+    import nevergrad as ng
+
+    space = ng.p.Array(shape=(3,), lower=-1.0, upper=1.0)
+    space.random_state.seed(seed)
+    optimiser = ng.optimizers.CMA(parametrization=space, budget=max(LOOKS) + 1)
+    while True:
+        asked = optimiser.ask()
+        walked = yield asked.value, optimiser.provide_recommendation().value
+        optimiser.tell(asked, -walked)
+
+
+def optuna_gp(seed: int) -> Session:
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=5)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
+    while True:
+        trial = study.ask()
+        asked = np.array([trial.suggest_float(name, -1.0, 1.0) for name in "abc"])
+        kept = None
+        with suppress(ValueError):  # nothing was told yet
+            kept = np.array([study.best_params[name] for name in "abc"])
+        walked = yield asked, kept
+        study.tell(trial, walked)
+
+
+def ax(seed: int) -> Session:
+    from ax.api.client import Client
+    from ax.api.configs import RangeParameterConfig
+
+    client = Client(random_seed=seed)
+    client.configure_experiment(
+        parameters=[
+            RangeParameterConfig(name=name, parameter_type="float", bounds=(-1.0, 1.0))
+            for name in "abc"
+        ]
+    )
+    client.configure_optimization(objective="distance")
+    client.configure_generation_strategy(initialization_budget=5)
+    walks = 0
+    while True:
+        ((index, told),) = client.get_next_trials(max_trials=1).items()
+        kept = None
+        if walks in LOOKS:
+            best, *_ = client.get_best_parameterization()
+            kept = np.array([best[name] for name in "abc"])
+        walked = yield np.array([told[name] for name in "abc"]), kept
+        client.complete_trial(trial_index=index, raw_data={"distance": float(walked)})
+        walks += 1
+
+
+RIVALS: dict[str, tuple[Callable[[int], Session], str]] = {
+    "pup": (ours, "botorch"),
+    "pup, simulated prior": (warm, "botorch"),
+    "Ax": (ax, "ax"),
+    "Optuna GP": (optuna_gp, "optuna"),
+    "nevergrad CMA": (cma, "nevergrad"),
+}
+
+
+def regrets(make: Callable[[int], Session], seed: int, noise: float) -> dict[str, Any]:
+    """Regret in percent after each look, and the seconds that a suggestion took."""
+    robot = landscapes.Robot.draw(seed, noise)
+    rng = np.random.default_rng((seed, 4))
+    best, session = robot.optimum(), make(seed)
+    found: dict[str, Any] = {}
+    spent = []
+    walked: Any = None
+    for walks in range(max(LOOKS) + 1):
+        began = time.process_time()
+        asked, kept = session.send(walked)  # type: ignore[attr-defined]
+        spent.append(time.process_time() - began)
+        if walks in LOOKS:
+            assert kept is not None
+            found[str(walks)] = 100 * (1 - float(robot.expected(np.asarray(kept))) / best)
+        walked = robot.walk(np.asarray(asked), rng)
+    return found | {"seconds": float(np.quantile(spent[6:], 0.95))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--noise", type=float, default=0.05, help="m")
+    parser.add_argument("--only", nargs="+", default=list(RIVALS))
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    import torch
+
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    table: dict[str, Any] = {}
+    for name in options.only:
+        make, package = RIVALS[name]
+        if find_spec(package) is None:
+            print(f"{name}: skipped, {package} is not installed")
+            continue
+        seeds = range(options.first, options.first + options.robots)
+        runs = [regrets(make, seed, options.noise) for seed in seeds]
+        row: dict[str, Any] = {}
+        for look in map(str, LOOKS):
+            found = np.array([r[look] for r in runs])
+            error = found.std(ddof=1) / np.sqrt(len(found)) if len(found) > 1 else 0.0
+            row[look] = {
+                "mean": found.mean(),
+                "error": error,
+                "median": float(np.median(found)),
+                "each": found.tolist(),
+            }
+        row["seconds_p95"] = float(np.median([r["seconds"] for r in runs]))
+        table[name] = row
+        told = "; ".join(
+            f"{look} walks: {row[look]['mean']:.1f} ± {row[look]['error']:.1f} % (median "
+            f"{row[look]['median']:.1f})"
+            for look in map(str, LOOKS)
+        )
+        print(f"{name}: {told}; suggestion p95 {row['seconds_p95']:.2f} s", flush=True)
+        if options.out:
+            document = {"schema": 1, "robots": options.robots, "noise": options.noise}
+            options.out.write_text(json.dumps(document | {"optimisers": table}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
