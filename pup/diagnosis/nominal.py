@@ -231,4 +231,4 @@ def _refit_of_itself(
         ends.append((float(np.max(np.abs(own.at - fit.at) / deviation)), own.chi2))
         if ends[-1][0] <= SELF or own.chi2 < SPARE * len(simulated):
             break
-    return min(ends)
+    return min(ends, key=lambda end: end[1])
