@@ -299,8 +299,7 @@ def test_bno055(one: Bench) -> None:
         one.side("wait", time=0.1)
         heading, roll, pitch = np.frombuffer(ask(1, 0x1A, 6, answer=8)[2:], "<i2") / 16
         true = one.side("pose")["tilt"]
-        offset = math.degrees(DARWIN.gait.imu_pitch_offset)
-        assert pitch == pytest.approx(math.degrees(true[1]) - offset, abs=6)
+        assert pitch == pytest.approx(math.degrees(true[1]), abs=6)
         assert -roll == pytest.approx(math.degrees(true[0]), abs=6)
         assert 0 <= heading <= 360
         quaternion = np.frombuffer(ask(1, 0x20, 8, answer=10)[2:], "<i2") / 2**14

@@ -28,6 +28,7 @@ POWER, TRIGGER, AXES, SIGNS = 0x3E, 0x3F, 0x41, 0x42
 WRITABLE = frozenset((PAGE_ID, UNITS, MODE, POWER, TRIGGER, 0x40, AXES, SIGNS, *range(0x43, SIZE)))
 RESET = 0x20  # bit of the trigger register
 RADIANS_PER_S, RADIANS, ANDROID = 1 << 1, 1 << 2, 1 << 7  # bits of the unit register
+DEGREES, MILLIRADIANS = 16 * 180 / np.pi, 900.0  # counts per rad or rad/s in either unit
 LYING = np.array([np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)])
 """The chip in the torso: its x is the torso's -y, its y the torso's x."""
 
@@ -128,8 +129,8 @@ class Bno055:
         rate, force = _lying(rate), _lying(force)
         down = 9.81 * _upright(turn)
         unit = registers[UNITS]
-        angle = 900.0 if unit & RADIANS else 16 * 180 / np.pi
-        speed = 900.0 if unit & RADIANS_PER_S else 16 * 180 / np.pi
+        angle = MILLIRADIANS if unit & RADIANS else DEGREES
+        speed = MILLIRADIANS if unit & RADIANS_PER_S else DEGREES
         self._put(FORCE, force * 100)
         self._put(GYRO, rate * speed)
         self._put(EULER, euler(turn, bool(unit & ANDROID)) * angle)

@@ -144,14 +144,13 @@ class Character:
     imu: Imu
 
 
-def draw(seed: int, joints: int, bodies: int, imu_pitch: float = 0.0) -> Character:
+def draw(seed: int, joints: int, bodies: int) -> Character:
     """Draw a robot.
 
     Args:
       seed: the same one gives the same robot.
       joints: how many servos it has.
       bodies: how many bodies its model has, with the world.
-      imu_pitch: by which IMUs of this kind of robot report too little pitch, rad.
     """
     rng = np.random.default_rng((seed, 0x0B07))
     return Character(
@@ -170,7 +169,7 @@ def draw(seed: int, joints: int, bodies: int, imu_pitch: float = 0.0) -> Charact
             tilt=rng.normal(0.0, 0.004, 2),
         ),
         imu=Imu(
-            mount=rng.normal((0.0, -imu_pitch, 0.0), (0.03, 0.03, 0.03)),
+            mount=rng.normal(0.0, 0.03, 3),
             delay=rng.uniform(0.01, 0.025),
             noise=rng.uniform(0.002, 0.006),
             rate_noise=rng.uniform(0.004, 0.01),

@@ -117,7 +117,7 @@ def multiply(a: Array, b: Array) -> Array:
 
 def conjugate(turn: Array) -> Array:
     """The opposite turn."""
-    return turn * np.array([1.0, -1.0, -1.0, -1.0])
+    return np.asarray(turn * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def rotate(turn: Array, vector: Array) -> Array:
@@ -128,4 +128,4 @@ def rotate(turn: Array, vector: Array) -> Array:
 def _turn(angles: Array) -> Array:
     """The quaternion of a small turn about x, y, z, rad."""
     half = np.array([1.0, *(angles / 2)])
-    return half / np.linalg.norm(half)
+    return np.asarray(half / np.linalg.norm(half))

@@ -49,7 +49,7 @@ class Framer:
     def feed(self, data: bytes) -> list[Packet]:
         """Packets that these bytes complete."""
         self._left += data
-        found = []
+        found: list[Packet] = []
         while True:
             start = self._left.find(HEADER)
             if start < 0:

@@ -19,6 +19,7 @@ from hardware_agent.virtual.skeleton import STEP, bodies_of, build, standing
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
+Joints = int | slice
 HEIGHT = 0.5  # m by which a robot hangs higher than it stands
 STILL = 0.3  # rad/s below which all joints count as still
 GRIP, TIRED = 0.5, 2.0  # s of a stiff and still robot, and of a stiff one, until a hand lets go
@@ -68,15 +69,14 @@ class Plant:
         self.ordered = 0  # goals ever given
         self.held = np.full(len(models), Hold.NOT)
         self._stiff, self._still = np.zeros((2, len(models)))
-        self._late: deque[tuple[int, int, int, float]] = deque()
+        self._late: list[deque[tuple[int, Joints, float | Array]]] = [deque() for _ in models]
         self.place(range(len(models)))
 
     @classmethod
     def of(cls, robot: RobotDescription, seeds: Sequence[int]) -> "Plant":
         """Robots drawn from seeds, one each."""
-        pitch = robot.gait.imu_pitch_offset if robot.gait else 0.0
         joints, bodies = len(robot.joints), bodies_of(robot)
-        return cls(robot, [draw(seed, joints, bodies, pitch) for seed in seeds])
+        return cls(robot, [draw(seed, joints, bodies) for seed in seeds])
 
     @property
     def time(self) -> float:
@@ -117,11 +117,17 @@ class Plant:
         """Let go of a robot that is held."""
         self._hold(np.array([lane]), Hold.NOT)
 
-    def order(self, lane: int, joint: int, goal: float) -> None:
-        """Give one servo a goal, ticks; it takes effect after the servo's latency."""
+    def order(self, lane: int, joints: Joints, goal: float | Array) -> None:
+        """Give servos a goal; it takes effect after their latency.
+
+        Args:
+          lane: of which robot.
+          joints: which of them, or all.
+          goal: ticks.
+        """
         due = self.steps + round(self.characters[lane].motors.latency / STEP)
         self.ordered += 1
-        self._late.append((due, lane, joint, goal))
+        self._late[lane].append((due, joints, goal))
 
     def encoders(self) -> Array:
         """What the encoders say now, ticks, shape (n_lanes, n_joints)."""
@@ -132,9 +138,10 @@ class Plant:
     def step(self, count: int = 1) -> None:
         """Let some steps of time pass."""
         for _ in range(count):
-            while self._late and self._late[0][0] <= self.steps:
-                _, lane, joint, goal = self._late.popleft()
-                self.drives.orders.goal[lane, joint] = goal
+            for lane, late in enumerate(self._late):
+                while late and late[0][0] <= self.steps:
+                    _, joints, goal = late.popleft()
+                    self.drives.orders.goal[lane, joints] = goal
             self._force[:, self.dofs] = self.drives.tick(self.angles, self.speeds)
             self.batch.step()
             self.steps += 1

@@ -1,17 +1,19 @@
 """MX-28 servos: what their registers say about the motion, and what the motion says in them."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hardware_agent.virtual.device import Device
-from hardware_agent.virtual.drives import CENTRE, TICK
+from hardware_agent.virtual.drives import TICK
 from hardware_agent.virtual.memory import Fault, RefusedError
 from hardware_agent.virtual.plant import Plant
 from hardware_agent.virtual.tables import MX28_1, MX28_2, ControlTable, Register
 
 RPM = 2 * np.pi / 60  # rad/s
 NEAR = 10  # ticks from the goal within which a servo does not count as moving
+PER_KP = 8  # counts of P of 1.0 for a Kp of 1
 VOLTAGE, OVERHEATING, OVERLOAD = 1 << 0, 1 << 2, 1 << 5
 """Error bits of 1.0 and bits of the hardware error status of 2.0."""
 
@@ -170,9 +172,9 @@ class Servo1(Servo):
             case "p_gain":
                 self._order("kp", value)
             case "i_gain":
-                self._order("ki", value * 8 * 1000 / 2048)
+                self._order("ki", value * PER_KP * 1000 / 2048)
             case "d_gain":
-                self._order("kd", value * 8 * 4 / 1000)
+                self._order("kd", damping(value))
             case "moving_speed":
                 self._order("speed", value * self.SPEED / TICK if value else np.inf)
             case "goal_acceleration":
@@ -190,7 +192,7 @@ class Servo1(Servo):
         self.memory.put("torque_limit", 0)
         self._order("limit", 0.0)
 
-    TELL: ClassVar = {
+    TELL: ClassVar[dict[str, Callable[[Any], int]]] = {
         "present_position": lambda self: min(max(self.position, 0), 4095),
         "present_speed": lambda self: _signed(self.speed / self.SPEED, 1 << 10),
         "present_load": lambda self: _signed(self.duty * 1023, 1 << 10),
@@ -199,6 +201,11 @@ class Servo1(Servo):
         "moving": lambda self: int(abs(self.memory.get("goal_position") - self.position) > NEAR),
         "realtime_tick": lambda self: round(self.plant.time * 1000) % 32768,
     }
+
+
+def damping(count: int) -> float:
+    """Of the D gain of 1.0, P s: Kd = 4 D / 1000."""
+    return PER_KP * 4 * count / 1000
 
 
 def _signed(value: float, sign: int) -> int:
@@ -335,7 +342,7 @@ class Servo2(Servo):
     def _arrived(self) -> int:
         return int(abs(self.memory.get("goal_position") - self._shown()) <= NEAR)
 
-    TELL: ClassVar = {
+    TELL: ClassVar[dict[str, Callable[[Any], int]]] = {
         "hardware_error": lambda self: self.alarms(),
         "present_position": lambda self: self._shown(),
         "present_velocity": lambda self: round(self.speed / self.SPEED),
@@ -351,8 +358,3 @@ class Servo2(Servo):
         "moving_status": _arrived,
         "realtime_tick": lambda self: round(self.plant.time * 1000) % 32768,
     }
-
-
-def to_ticks(angle: float) -> int:
-    """The tick of an angle, as the agent sends it."""
-    return round(CENTRE + angle / TICK)
