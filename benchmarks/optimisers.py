@@ -10,6 +10,7 @@ expected distance falls short of the best one's, in percent of it.
 
 import argparse
 import json
+import logging
 import sys
 import time
 import warnings
@@ -154,6 +155,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
+    logging.disable(logging.WARNING)  # Ax tells of each trial
     table: dict[str, Any] = {}
     for name in options.only:
         make, package = RIVALS[name]

@@ -10,7 +10,6 @@ import logging
 import os
 import re
 import time
-from dataclasses import asdict
 from typing import Any
 
 import zmq
@@ -71,6 +70,7 @@ class Link:
         self.authenticator = AsyncioAuthenticator(self.context)
         self.socket = self.context.socket(zmq.ROUTER)
         self.bound = False
+        self._keys_at = -1
         self._queues: dict[str, asyncio.Queue[Message]] = {}
         self._workers: list[asyncio.Task[None]] = []
 
@@ -82,7 +82,7 @@ class Link:
         """
         public, secret = self.ring.gateway()
         self.authenticator.start()
-        self.reload_keys()
+        self.refresh_keys()
         self.authenticator.configure_curve_callback(DOMAIN, self)
         socket = self.socket
         socket.curve_server = True
@@ -102,16 +102,20 @@ class Link:
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Whether a key, in z85, is let in; called by the authenticator."""
-        self.reload_keys()
+        self.refresh_keys()
         known = key in self.names
         if not known:
             self.conductor.metrics.refused.labels("unknown key").inc()
             log.warning("unknown CURVE key refused")
         return known
 
-    def reload_keys(self) -> None:
-        """Read the folder of agents' keys; a key that is gone from it is let in no more."""
-        self.names = self.ring.agents()
+    def refresh_keys(self) -> None:
+        """Read the agents' keys where their folder changed; who is gone is let in no more."""
+        folder = self.ring.agents_folder
+        changed = folder.stat().st_mtime_ns if folder.exists() else 0
+        if changed == self._keys_at:
+            return
+        self.names, self._keys_at = self.ring.agents(), changed
         for name in self.names.values():
             self.conductor.agents.setdefault(name, AgentView(name))
 
@@ -132,14 +136,10 @@ class Link:
                 self.conductor.metrics.refused.labels("too many").inc()
 
     async def watch(self) -> None:
-        """Read the keys again when there are others."""
-        folder, seen = self.ring.agents_folder, 0
+        """Notice keys that are revoked while their agents are connected."""
         while True:
             await asyncio.sleep(1.0)
-            changed = folder.stat().st_mtime_ns if folder.exists() else 0
-            if changed != seen:
-                self.reload_keys()
-                seen = changed
+            self.refresh_keys()
 
     def send(self, agent: str, body: Body) -> None:
         """Send a message to an agent, if it is connected."""
@@ -199,7 +199,6 @@ class Link:
             case Hello() as hello:
                 view.greet(hello)
                 log.info("hello", extra={"agent": agent, "version": hello.version})
-                await self.conductor.store.met(agent, asdict(hello))
                 self.send(agent, Heartbeat())
                 for entry in hello.journal:
                     if entry.state in ("accepted", "running"):

@@ -128,17 +128,6 @@ class Store:
         query = query.order_by(table.c.id).limit(limit)
         return await self.run(lambda c: [dict(r._mapping) for r in c.execute(query)])
 
-    async def agents(self) -> list[Row]:
-        """What agents said of themselves last."""
-        query = sa.select(self.tables["agents"])
-        return await self.run(lambda c: [dict(r._mapping) for r in c.execute(query)])
-
-    async def met(self, name: str, hello: Row) -> None:
-        """Keep what an agent says of itself."""
-        await self.run(
-            lambda c: self._put(c, "agents", {"name": name}, {"hello": hello, "seen": time.time()})
-        )
-
     async def answer(self, key: str, who: str) -> Answer | None:
         """The answer given to a request before."""
         table = self.tables["answers"]

@@ -1,4 +1,4 @@
-"""Studies, trials, their history, agents, answers to repeated requests."""
+"""Studies, trials, their history, answers to repeated requests."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -49,12 +49,6 @@ def upgrade() -> None:
         sa.Column("detail", sa.JSON, nullable=False),
     )
     op.create_table(
-        "agents",
-        sa.Column("name", sa.String(64), primary_key=True),
-        sa.Column("hello", sa.JSON, nullable=False),
-        sa.Column("seen", sa.Float, nullable=False),
-    )
-    op.create_table(
         "answers",
         sa.Column("key", sa.String(128), primary_key=True),
         sa.Column("who", sa.String(64), primary_key=True),
@@ -67,5 +61,5 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     """Drop the tables."""
-    for table in ("answers", "agents", "events", "trials", "studies", "gateways"):
+    for table in ("answers", "events", "trials", "studies", "gateways"):
         op.drop_table(table)

@@ -1,0 +1,177 @@
+"""The pages in a real headless Chromium: a study as it goes on, the gate, agents, on a phone."""
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import fake_agent
+import gateways
+import pytest
+
+pytest.importorskip("fastapi")
+pytest.importorskip("botorch")
+playwright = pytest.importorskip("playwright.sync_api")
+
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
+PHONE = {"width": 390, "height": 844}
+SHOTS = os.environ.get("PUP_SHOTS")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
+    with gateways.running(tmp_path_factory.mktemp("pages") / "data") as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as p:
+        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield made
+        made.close()
+
+
+@pytest.fixture
+def open_page(browser, service):
+    """Opens a page as somebody; collects errors and requests to elsewhere."""
+    contexts, wrong = [], []
+
+    def opened(role="operator", **options):
+        context = browser.new_context(base_url=service.url, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda m: wrong.append(m.text) if "Security Policy" in m.text else None)
+        page.on(
+            "request",
+            lambda r: (
+                None if r.url.startswith(service.url) else wrong.append(f"elsewhere: {r.url}")
+            ),
+        )
+        page.on("dialog", lambda dialog: dialog.accept())
+        if role:
+            page.goto("/login")
+            page.get_by_label("Token").fill(service.tokens[role])
+            page.get_by_role("button", name="Enter").click()
+            page.wait_for_url("**/")
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+def shot(page, name):
+    if SHOTS:
+        Path(SHOTS).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=f"{SHOTS}/{name}.png", full_page=True)
+
+
+def test_without_a_token_there_is_the_way_in(open_page):
+    page = open_page(role=None)
+    page.goto("/studies/any")
+    assert page.url.endswith("/login")
+    page.get_by_label("Token").fill("wrong")
+    page.get_by_role("button", name="Enter").click()
+    page.get_by_text("not known").wait_for()
+    shot(page, "login")
+
+
+def test_an_operator_leads_a_study_to_its_end(open_page, service):
+    keys = service.agent_keys("page-1")
+    walk = fake_agent.walks(lambda eta: 0.8 - 0.2 * sum((x - 0.3) ** 2 for x in eta))
+    asked = gateways.STUDY | {"name": "stroll", "gate": "operator", "trials": 7, "repeats": 1}
+    page = open_page()
+    page.get_by_text("No study yet").wait_for()
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk, pause=0.3):
+        http.post("/v1/studies", json=asked | {"initial": 6})
+        page.reload()
+        page.get_by_role("link", name="stroll").click()
+        for number in range(1, 9):
+            page.get_by_role("button", name=f"Release trial {number}", exact=True).click()
+            if number == 8:
+                shot(page, "study")
+        page.get_by_text("done", exact=True).first.wait_for()
+        assert page.locator("svg").count() == 4
+        assert page.locator("polygon.band").count() == 3
+        assert page.locator("tbody tr").count() == 8
+        assert page.get_by_role("button", name="Release").count() == 0
+        shot(page, "study_done")
+        page.get_by_role("link", name="Studies").click()
+        page.get_by_text("7 of 7").wait_for()
+        shot(page, "studies")
+        page.get_by_role("link", name="Agents").click()
+        page.get_by_text("41.5").wait_for()
+        shot(page, "agents")
+        phone = open_page(viewport=PHONE, has_touch=True, is_mobile=True)
+        for path, name in (("/", "studies"), ("/studies/stroll", "study"), ("/agents", "agents")):
+            phone.goto(path)
+            wide = phone.evaluate("document.documentElement.scrollWidth")
+            assert wide <= PHONE["width"], f"{path} is wider than a phone"
+            shot(phone, f"phone_{name}")
+
+
+def test_a_viewer_has_no_buttons_and_a_stop_stops(open_page, service):
+    keys = service.agent_keys("page-2")
+    asked = gateways.STUDY | {"name": "halt", "agent": "page-2", "trials": 2, "initial": 2}
+    walk = lambda body: None  # noqa: E731 - a walk that does not end
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk) as agent:
+        http.post("/v1/studies", json=asked)
+        page, viewer = open_page(), open_page("viewer")
+        for one in (page, viewer):
+            one.goto("/studies/halt")
+            one.get_by_text("0.10 m").wait_for()
+        assert viewer.get_by_role("button", name="STOP").count() == 0
+        assert viewer.get_by_role("button", name="Cancel").count() == 0
+        shot(page, "study_running")
+        page.get_by_role("button", name="STOP page-2").click()
+        page.get_by_text("was stopped by operator").wait_for()
+        assert agent.state == "stopped"
+
+
+def test_names_are_text_and_nothing_else(open_page, service):
+    """What others say ends up on pages as text."""
+    keys = service.agent_keys("page-3")
+
+    def walk(body):
+        return fake_agent.Finished(
+            body.trial,
+            body.attempt,
+            body.fence,
+            fake_agent.Outcome.ABORTED,
+            reason="<script>document.title='taken'</script><img src=x onerror=alert(1)>",
+        )
+
+    asked = gateways.STUDY | {"name": "text", "agent": "page-3", "failures": 1}
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk):
+        http.post("/v1/studies", json=asked)
+        service.wait_for("text", "paused")
+        page = open_page()
+        page.goto("/studies/text")
+        page.get_by_text("<script>document").first.wait_for()
+        assert page.title() == "pup: text" and page.locator("img").count() == 0
+        page.get_by_role("button", name="Retry").wait_for()
+        shot(page, "study_paused")
+
+
+def test_a_gateway_that_is_away_is_told_and_comes_back(open_page, service):
+    with service.client() as http:
+        http.post("/v1/studies", json=gateways.STUDY | {"name": "away", "gate": "operator"})
+    page = open_page()
+    page.goto("/studies/away")
+    page.get_by_role("button", name="Release trial 1").wait_for()
+    service.kill(signal.SIGKILL)
+    page.get_by_text("does not answer").first.wait_for()
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_text("nothing was done").wait_for()
+    shot(page, "away")
+    service.start()
+    page.locator("#away").wait_for(state="hidden")
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_text("paused", exact=True).wait_for()
