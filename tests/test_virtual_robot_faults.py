@@ -244,7 +244,27 @@ def test_command_line_refuses_and_cleans_up(tmp_path: Path) -> None:
     done = pup("virtual-robot", "--link", tmp_path / "no" / "link", *where)
     assert done.code == 2
     assert pup("virtual-robot", "--robot", "emps", "--link", tmp_path / "b", *where).code == 2
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
+    (tmp_path / "mine").symlink_to(tmp_path / "file")
+    assert pup("virtual-robot", "--link", tmp_path / "mine", *where).code == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine"]
+
+
+def test_a_path_where_a_robot_lives_is_left_alone(tmp_path: Path) -> None:
+    with virtual_robot(tmp_path) as bench:
+        names = {"link": "other", "imu": "another", "side": "side"}
+        told = [part for name, file in names.items() for part in (f"--{name}", tmp_path / file)]
+        done = pup("virtual-robot", *told)
+        assert (done.code, "another robot" in done.err) == (2, True)
+        assert bench.side("time")["ok"]
+
+
+def test_what_a_killed_robot_leaves_is_replaced(tmp_path: Path) -> None:
+    with virtual_robot(tmp_path) as bench:
+        bench.process.kill()
+        bench.process.wait()
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["imu", "link", "side"]
+        with virtual_robot(tmp_path) as heir:
+            assert heir.packets.ping(heir.port, BOARD)[1] == COMM_SUCCESS
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])

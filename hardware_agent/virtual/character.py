@@ -158,7 +158,7 @@ def draw(seed: int, joints: int, bodies: int) -> Character:
         motors=_motors(rng, joints),
         supply=Supply(
             charge=rng.uniform(0.6, 1.0),
-            capacity=rng.uniform(0.8, 1.0),
+            capacity=rng.uniform(1.5, 1.9),
             resistance=rng.uniform(0.08, 0.25),
         ),
         body=_body(rng, bodies),

@@ -9,7 +9,7 @@ import select
 import socket
 import time
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Event
@@ -66,9 +66,13 @@ class Server(AbstractContextManager["Server"]):
         self.robot, self.speed, self.period = robot, speed, period
         self.faults = Faults(robot, robot.plant.characters[0].seed)
         self._framer = Framer()
-        self.link = Terminal(ports.link)
-        self.imu = Terminal(ports.imu)
-        self.side = Side(ports.side, self.command)
+        with ExitStack() as made:
+            self.side = Side(ports.side, self.command)
+            made.callback(self.side.close)
+            self.link = Terminal(ports.link)
+            made.callback(self.link.pull)
+            self.imu = Terminal(ports.imu)
+            made.pop_all()
         self._heard = {self.link: 0.0, self.imu: 0.0}
         self._wire = {self.link: 0.0, self.imu: 0.0}
         self._epoch = time.monotonic()
@@ -114,6 +118,8 @@ class Server(AbstractContextManager["Server"]):
                 self._hear_imu(self.imu.read())
             elif isinstance(one, socket.socket):
                 self.side.serve(one)
+        if self.faults.pulled:
+            self.link.drop()
         now = time.monotonic()
         for port in ports:
             port.flush(now)

@@ -22,7 +22,7 @@ class Side:
     """The socket and those who are connected.
 
     Args:
-      path: of the socket; an old one in its place is replaced.
+      path: of the socket; one that nobody listens at any more is replaced.
       answer: what is done with a command.
 
     Raises:
@@ -36,9 +36,12 @@ class Side:
         self._door = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             if path.is_socket():
-                path.unlink()
+                _make_way(path)
             self._door.bind(str(path))
             os.chmod(path, 0o600)
+        except InputError:
+            self._door.close()
+            raise
         except OSError as error:
             self._door.close()
             told = error.strerror or error
@@ -56,8 +59,7 @@ class Side:
         if ready is self._door:
             with suppress(OSError):
                 guest, _ = self._door.accept()
-                guest.setblocking(True)
-                guest.settimeout(1.0)
+                guest.setblocking(False)
                 self._guests[guest] = bytearray()
             return
         try:
@@ -93,3 +95,14 @@ class Side:
         except (InputError, ValueError, RecursionError) as error:
             answer = {"ok": False, "error": " ".join(str(error).split())}
         return json.dumps(answer).encode() + b"\n"
+
+
+def _make_way(path: Path) -> None:
+    """Take away a socket that was left behind."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as door:
+        try:
+            door.connect(str(path))
+        except OSError:
+            path.unlink()
+            return
+    raise InputError(f"{path}: another robot is there; use another path, or end it")

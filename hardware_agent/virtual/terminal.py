@@ -16,6 +16,7 @@ SPEEDS = {
     if name.startswith("B") and name[1:].isdecimal()
 }
 CHUNK = 4096  # bytes
+TERMINALS = "/dev/pts/"
 
 
 class Terminal:
@@ -43,8 +44,8 @@ class Terminal:
         tty.setraw(self._theirs)
         os.set_blocking(self._ours, False)
         try:
-            if self.path.is_symlink():
-                self.path.unlink()
+            if self.path.is_symlink() and os.readlink(self.path).startswith(TERMINALS):
+                self.path.unlink()  # left behind by another
             self.path.symlink_to(os.ttyname(self._theirs))
         except OSError as error:
             os.close(self._ours)
@@ -61,7 +62,7 @@ class Terminal:
                 self.path.unlink()
         os.close(self._ours)
         os.close(self._theirs)
-        self._later.clear()
+        self.drop()
         self.plugged = False
 
     def fileno(self) -> int:
@@ -88,6 +89,10 @@ class Terminal:
     def due(self) -> float | None:
         """When the next bytes are to be sent."""
         return self._later[0][0] if self._later else None
+
+    def drop(self) -> None:
+        """Lose what waits to be sent."""
+        self._later.clear()
 
     def flush(self, now: float) -> None:
         """Send what is due; what nobody takes is lost, as on a wire."""
