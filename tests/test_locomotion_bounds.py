@@ -37,7 +37,7 @@ def test_bounds_are_read_around_the_fitted_values() -> None:
         ({"lower": None}, "parameter 'rho/arm' has no bounds lower and upper"),
         ({"upper": "high"}, "parameter 'rho/arm' has no bounds lower and upper"),
         ({"lower": 2.0, "upper": 1.0}, "parameter 'rho/arm': [2, 1] are no bounds"),
-        ({"upper": float("inf")}, "parameter 'rho/arm': [1.02879, inf] are no bounds"),
+        ({"lower": 1.0, "upper": float("inf")}, "parameter 'rho/arm': [1, inf] are no bounds"),
         ({"name": "rho/tail"}, "parameter 'rho/tail' is not one of robot 'darwin_op2'"),
     ],
 )
