@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hardware_agent.config import ControlSettings
 from hardware_agent.rollout import Rollout
-from hardware_agent.safety import Senses
+from hardware_agent.senses import Senses
 from pup.wire import AgentState, Assign, Outcome
 
 Array = NDArray[np.float64]

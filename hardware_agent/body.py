@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from hardware_agent.bus import Answers, Bus
 from hardware_agent.config import Settings
 from hardware_agent.imu import Orientation, imu_of
+from hardware_agent.limits import Applied, Limiter
 from hardware_agent.port import BusError
-from hardware_agent.safety import Applied, Guard, Limiter, Response, Senses, Trip
+from hardware_agent.safety import Guard
+from hardware_agent.senses import Response, Senses, Trip
 from pup.errors import InputError
 from pup.robot import RobotDescription
 
@@ -43,7 +45,7 @@ class Body:
         lower = np.array([joint.lower for joint in robot.joints])
         upper = np.array([joint.upper for joint in robot.joints])
         self.limiter = Limiter(self.names, lower, upper, settings.safety)
-        self.torque = False
+        self.torque = self.ready = False
         self.repeated = self.lost = 0
         self._forget()
 
@@ -69,12 +71,13 @@ class Body:
           BusError: something does not answer.
           InputError: something else is there than was configured.
         """
-        self.torque = False
+        self.torque = self.ready = False
         self._forget()
         put_right = self.bus.open()
         if self.imu is not None:
             self.imu.close()
             self.imu.open()
+        self.ready = True
         return put_right
 
     def close(self) -> None:

@@ -7,7 +7,7 @@ cannot bulk read at all in release 4.1), while a tick wants what there is and wh
 
 import math
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
@@ -136,7 +136,7 @@ class Bus:
             whole = len(found) == len(self.ids) and bool(board) == self._senses
         return Answers(found, next(iter(board.values()), None), tries)
 
-    def write(self, goals: Sequence[float]) -> None:
+    def write(self, goals: Iterable[float]) -> None:
         """Tell every servo its goal.
 
         Args:
@@ -149,7 +149,7 @@ class Bus:
         for _ in range(WRITES):
             self._all(self.registers.torque_enable, int(on))
 
-    def prepare(self, goals: Sequence[float], deadline: float) -> None:
+    def prepare(self, goals: Iterable[float], deadline: float) -> None:
         """Set limp servos up such that they stay where they are when torque comes.
 
         Args:
@@ -157,7 +157,7 @@ class Bus:
           deadline: s without an instruction after which servos that can stop by themselves.
         """
         own = self.registers
-        for span, value in zip(own.gains, self.settings.gains, strict=True):
+        for span, value in zip(own.gains, self.settings.gains or own.paper, strict=True):
             self._all(span, value)
         self._all(own.speed, 0)
         self.soften(1.0)

@@ -35,7 +35,8 @@ class BusSettings:
       board: id of a CM-730 or CM-740, which switches the servos' current; 0 for none.
       timeout: largest delay of an answer beside its time on the wire, s.
       tries: how often a tick asks those that did not answer.
-      gains: P, I, D of the servos' firmware (paper, section VI-A).
+      gains: P, I, D of the servos' firmware; None for the paper's 32, 0, 16 (section VI-A), which
+        with Protocol 2.0 are 512, 0, 1.
     """
 
     port: str
@@ -47,7 +48,7 @@ class BusSettings:
     board: int | None = None
     timeout: float = 0.004
     tries: int = 3
-    gains: tuple[int, ...] = (32, 0, 16)
+    gains: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ class Settings:
         if table.integer("schema") != 1:
             raise table.mistake("schema", "not 1; this version reads schema = 1 only")
         parts = {f.name: f.type for f in fields(cls) if f.name in PARTS}
-        own = {
+        own: dict[str, Any] = {
             "name": table.name("name"),
             "robot": table.text("robot"),
             "state": _path(table, "state", file),
@@ -354,10 +355,13 @@ def _mistakes(part: Any) -> Any:
             yield "protocol", 'Protocol 1.0 has read = "bulk" and write = "sync" only'
         if part.read == "sync" and part.detail != "all":
             yield "detail", 'a sync read asks all servos for the same; use detail = "all"'
-        if len(part.gains) != 3 or not all(0 <= gain <= 16383 for gain in part.gains):
-            yield "gains", "write P, I and D of the firmware, such as [32, 0, 16]"
-        if part.protocol == 1 and max(part.gains) > 254:
-            yield "gains", f"{list(part.gains)}; Protocol 1.0 takes 0 to 254"
+        if part.gains is not None:
+            most = 254 if part.protocol == 1 else 16383
+            if len(part.gains) != 3 or not all(0 <= gain <= most for gain in part.gains):
+                yield (
+                    "gains",
+                    f"write P, I and D of the firmware, such as [32, 0, 16], up to {most}",
+                )
     if isinstance(part, ImuSettings):
         if part.kind.startswith("bno055") and not part.port:
             yield "port", f"missing; where is the {part.kind}?"

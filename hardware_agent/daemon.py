@@ -103,6 +103,8 @@ class Agent:
         try:
             while not self._ending:
                 self._turn()
+                if not self._motion.is_alive():  # its error stands in the log
+                    raise RuntimeError("the control loop has ended")
         finally:
             self._close()
 
@@ -168,7 +170,7 @@ class Agent:
         poller.register(self._bell, zmq.POLLIN)
         for socket in self._link.sockets if self._link else ():
             poller.register(socket, zmq.POLLIN)
-        poller.poll(TURN * 1000)
+        poller.poll(round(TURN * 1000))
         with suppress(BlockingIOError):
             os.eventfd_read(self._bell)
         if self._stopper is not None and self._stopper.poll() is not None:
@@ -196,17 +198,23 @@ class Agent:
             refused = self._motion.enable()
         elif do == "disable":
             refused = self._motion.disable()
-        elif do == "arm":
-            return self._conductor.arm()
-        elif do == "skip":
-            return self._conductor.skip(str(command.get("reason", "skipped by the operator")))
-        elif do == "distance":
-            return self._conductor.measured(float(command.get("distance", "nan")))
         else:
-            raise InputError(f"{do!r} is no command of this agent")
+            return self._order(command)
         if refused is not None:
             raise InputError(refused.reason)
         return {"state": str(self._motion.status.state)}
+
+    def _order(self, command: dict[str, Any]) -> None:
+        """What the operator tells of a trial."""
+        do = command.get("do")
+        if do == "arm":
+            self._conductor.arm()
+        elif do == "skip":
+            self._conductor.skip(str(command.get("reason", "skipped by the operator")))
+        elif do == "distance":
+            self._conductor.measured(float(command.get("distance", "nan")))
+        else:
+            raise InputError(f"{do!r} is no command of this agent")
 
     def _watch_stop(self) -> None:
         """Start the command that waits for the emergency stop, if there is one."""

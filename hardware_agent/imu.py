@@ -125,10 +125,10 @@ class Uart:
 
     def _receive(self, length: int) -> bytes:
         deadline = self._sent + (length + 5) * 10 / 115_200 + self._settings.timeout
-        read = b""
-        while len(read) < length:
+        read: bytes = self._port.read(length)
+        while len(read) < length and not (read[:1] == b"\xee" and len(read) >= 2):
             left = deadline - time.monotonic()
-            if left <= 0 or (read[:1] == b"\xee" and len(read) >= 2):
+            if left <= 0:
                 break
             select.select([self._port.fileno()], [], [], left)
             read += self._port.read(length - len(read))

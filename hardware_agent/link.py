@@ -8,6 +8,7 @@ for a connection proves nothing about the programs at its ends.
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import zmq
 import zmq.auth
@@ -38,12 +39,12 @@ class Link:
     ) -> None:
         self._settings = settings
         self._hello = hello
-        self._context = zmq.Context.instance()
+        self._context: zmq.Context[Any] = zmq.Context.instance()
         self._own = _key(settings.key, secret=True)
         self._gateway = _key(settings.gateway_key, secret=False)[0]
         self._poller = zmq.Poller()
-        self._socket: zmq.Socket | None = None
-        self._monitor: zmq.Socket | None = None
+        self._socket: zmq.Socket[Any] | None = None
+        self._monitor: zmq.Socket[Any] | None = None
         self._heard = self._opened = -1e9
         self._pause = settings.heartbeat * settings.liveness
         self.refused = 0
@@ -54,7 +55,7 @@ class Link:
         return time.monotonic() - self._heard < self._settings.heartbeat * self._settings.liveness
 
     @property
-    def sockets(self) -> "list[zmq.Socket]":
+    def sockets(self) -> "list[zmq.Socket[Any]]":
         """To poll; others after `tend`."""
         return [s for s in (self._socket, self._monitor) if s is not None]
 

@@ -27,10 +27,11 @@ from hardware_agent.activities import (
     Walk,
 )
 from hardware_agent.body import Body
+from hardware_agent.limits import Applied
 from hardware_agent.metronome import Metronome, Timing
 from hardware_agent.port import BusError
 from hardware_agent.rollout import Rollout
-from hardware_agent.safety import Applied, Response, Senses, Trip
+from hardware_agent.senses import Response, Senses, Trip
 from hardware_agent.watchdog import Watchdog
 from pup.errors import InputError
 from pup.wire import AgentState, Assign, Outcome
@@ -101,7 +102,7 @@ class Motion(threading.Thread):
         self._quit = False
         self._activity: Activity | None = None
         self._state, self._reason = AgentState.DISABLED, ""
-        self._bus = True
+        self._bus = body.ready
         self._limited: dict[str, str] = {}
         self._count = 0
         self._timing = self.metronome.timing()
@@ -272,6 +273,7 @@ class Motion(threading.Thread):
 
     def _enable(self, senses: Senses) -> Refused | None:
         if self._activity is None:
+            self._beat(torque=True)  # the watchdog watches from before it is on
             trip = self._body.enable(senses)
             if trip is not None:
                 return Refused(str(trip))
@@ -327,9 +329,9 @@ class Motion(threading.Thread):
 
     # The rest.
 
-    def _beat(self) -> None:
+    def _beat(self, torque: bool = False) -> None:
         if self._watchdog is not None:
-            self._watchdog.beat(self._body.torque)
+            self._watchdog.beat(torque or self._body.torque)
 
     def _told(self, senses: Senses | None) -> MotionStatus:
         return MotionStatus(

@@ -48,6 +48,7 @@ class Registers:
       gains: of P, I and D.
       speed: of the goal's motion; 0 for no limit.
       goal: position, ticks.
+      paper: P, I and D of the paper, Kp 4 and Kd 0.064, in the units of this firmware.
       power_limit: largest duty.
       full_power: value of it that limits nothing.
       bus_watchdog: 20 ms without an instruction after which the servo stops; None without one.
@@ -62,6 +63,7 @@ class Registers:
     status_level: Span
     torque_enable: Span
     gains: tuple[Span, Span, Span]
+    paper: tuple[int, ...]
     speed: Span
     goal: Span
     power_limit: Span
@@ -111,6 +113,7 @@ REGISTERS = {
         status_level=(16, 1),
         torque_enable=(24, 1),
         gains=((28, 1), (27, 1), (26, 1)),
+        paper=(32, 0, 16),
         speed=(32, 2),
         goal=(30, 2),
         power_limit=(34, 2),
@@ -127,6 +130,7 @@ REGISTERS = {
         status_level=(68, 1),
         torque_enable=(64, 1),
         gains=((84, 2), (82, 2), (80, 2)),
+        paper=(512, 0, 1),
         speed=(112, 4),
         goal=(116, 4),
         power_limit=(100, 2),

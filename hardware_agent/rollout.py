@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_agent.safety import Applied, Senses
+from hardware_agent.limits import Applied
+from hardware_agent.senses import Senses
 from pup.errors import InputError
 from pup.policy.bundle import NumpyPolicy
 from pup.recording import Recording

@@ -6,9 +6,6 @@ torque is on. It answers None, or why the robot must stop.
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Protocol
 
 import numpy as np
@@ -16,84 +13,9 @@ from numpy.typing import NDArray
 
 from hardware_agent.config import SafetySettings
 from hardware_agent.imu import Orientation
+from hardware_agent.senses import Response, Senses, Trip
 
 Array = NDArray[np.float64]
-
-
-class Response(Enum):
-    """How the robot is made safe.
-
-    Attributes:
-      LIMP: torque off.
-      SOFT: it keeps its pose with a small share of its power: who falls should neither break a gear
-        nor be thrown about.
-    """
-
-    LIMP = "limp"
-    SOFT = "soft"
-
-
-@dataclass(frozen=True)
-class Trip:
-    """A rule that was broken.
-
-    Attributes:
-      rule: its name.
-      reason: in words.
-      response: see Response.
-    """
-
-    rule: str
-    reason: str
-    response: Response = Response.LIMP
-
-    def __str__(self) -> str:
-        return f"{self.rule}: {self.reason}"
-
-
-@dataclass(frozen=True, eq=False)
-class Senses:
-    """What a tick knows; arrays in the order of the joints, NaN where nothing is known.
-
-    Attributes:
-      time: of the loop, s.
-      names: of the joints.
-      position: rad.
-      velocity: rad/s.
-      load: of full scale.
-      voltage: V.
-      temperature: °C.
-      alarms: of the servos, in words, by joint.
-      seen: when each servo answered last, s.
-      imu: its latest sample.
-      imu_seen: when that came, s.
-      has_imu: whether there is an IMU at all.
-      goal: written last, rad.
-      written: when, s.
-      walking: whether a rollout is under way.
-    """
-
-    time: float
-    names: tuple[str, ...]
-    position: Array
-    velocity: Array
-    load: Array
-    voltage: Array
-    temperature: Array
-    alarms: dict[str, str]
-    seen: Array
-    imu: Orientation | None
-    imu_seen: float
-    has_imu: bool
-    goal: Array
-    written: float
-    walking: bool
-
-    @property
-    def supply(self) -> float:
-        """Voltage at the servos: the median of what they tell, so that none of them can lie."""
-        known = self.voltage[~np.isnan(self.voltage)]
-        return float(np.median(known)) if len(known) else math.nan
 
 
 class Rule(Protocol):
@@ -413,56 +335,3 @@ class Guard:
             if reason is not None:
                 return Trip(rule.name, reason, rule.response)
         return None
-
-
-@dataclass(frozen=True, eq=False)
-class Applied:
-    """What became of a target.
-
-    Attributes:
-      goal: rad, within the limits.
-      limited: by joint, what held it back: "range" or "speed".
-    """
-
-    goal: Array
-    limited: dict[str, str]
-
-
-class Limiter:
-    """Keeps targets within the joints' ranges and speeds; what is no number, it refuses.
-
-    Args:
-      names: of the joints.
-      lower: least angles, rad.
-      upper: largest angles.
-      limits: of the configuration.
-    """
-
-    def __init__(
-        self, names: Sequence[str], lower: Array, upper: Array, limits: SafetySettings
-    ) -> None:
-        self._names = tuple(names)
-        self._lower, self._upper = lower, upper
-        self._speed = limits.speed
-
-    def apply(self, target: Array, last: Array, step: float) -> Applied | Trip:
-        """A target as it may be sent.
-
-        Args:
-          target: wanted, rad.
-          last: sent before.
-          step: time since, s.
-
-        Returns:
-          What may be sent, or the trip of a target that is not finite: it is never mended, for
-          whoever made it does not know what it does.
-        """
-        wrong = np.flatnonzero(~np.isfinite(target))
-        if len(wrong) or target.shape != last.shape:
-            names = ", ".join(self._names[j] for j in wrong[:3])
-            return Trip("bad target", f"the target of {names or 'some joints'} is no number")
-        ranged = np.clip(target, self._lower, self._upper)
-        goal = np.clip(ranged, last - self._speed * step, last + self._speed * step)
-        limited = {self._names[j]: "range" for j in np.flatnonzero(ranged != target)}
-        limited |= {self._names[j]: "speed" for j in np.flatnonzero(goal != ranged)}
-        return Applied(goal, limited)

@@ -233,7 +233,7 @@ class TrialBook:
 
     def _replay(self, entry: dict[str, object]) -> None:
         key = (str(entry["trial"]), int(entry["attempt"]))  # type: ignore[call-overload]
-        event = Event(entry["event"])
+        event = Event(str(entry["event"]))
         known = self._trials.get(key)
         if event is Event.ACCEPTED:
             told = entry["assign"]

@@ -95,7 +95,7 @@ def watch(beats: socket.socket, agent: int, timeout: float) -> str:
     """
     torque = False
     while True:
-        ready, _, _ = select.select([beats, agent], [], [], timeout if torque else None)
+        ready, _, _ = select.select([beats.fileno(), agent], [], [], timeout if torque else None)
         if agent in ready:
             return "the agent has ended"
         if not ready:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 from hardware_agent.control import say
 from pup.policy.bundle import PolicyCard, write_bundle
 from pup.policy.shape import Method, PolicyShape
-from pup.robot import RobotDescription
+from pup.robot import Gait, Harmonics, RobotDescription
 
 DARWIN = RobotDescription.load("darwin_op2")
 OBSERVATION = (
@@ -57,6 +58,7 @@ settle = 0.5
 
 [safety]
 late = 1.0
+stale = 0.3
 
 [watchdog]
 timeout = 5.0
@@ -68,14 +70,15 @@ side = "{folder}/side"
 """For a busy machine: patient where a real robot's agent must not be."""
 
 
-def bundle(folder: Path, bias: float = 0.0) -> Path:
-    """Write a policy that steps in place.
+def bundle(folder: Path, gait: Gait | None = None) -> Path:
+    """Write a policy that follows its reference.
 
     Args:
       folder: for the bundle.
-      bias: of its reach, rad: NaN makes a policy that tells nonsense.
+      gait: the reference; None for the robot's own, which steps in place and falls soon.
     """
-    assert DARWIN.gait is not None
+    gait = gait or DARWIN.gait
+    assert gait is not None
     shape = PolicyShape.of(Method.PUP, len(OBSERVATION), 4, len(DARWIN.joints))
     rng = np.random.default_rng(0)
     weights: dict[str, np.ndarray] = {
@@ -106,15 +109,28 @@ def bundle(folder: Path, bias: float = 0.0) -> Path:
         eta_lower=(-1.0,) * 3,
         eta_upper=(1.0,) * 3,
         rates=(25.0, 33.0),
-        reach=0.3 + bias,
+        reach=0.3,
         smoothing=5,
-        gait=DARWIN.gait,
+        gait=gait,
         bounds_sha256="0" * 64,
         robot_digest=DARWIN.digest,
         provenance={"made": "for tests"},
     )
     write_bundle(folder, card, weights)
     return folder
+
+
+def standing(**others: Harmonics) -> Gait:
+    """A reference that stands in the start pose.
+
+    Args:
+      others: what single joints do instead.
+    """
+    gait = DARWIN.gait
+    assert gait is not None and gait.start is not None
+    still = zip(DARWIN.joint_names, gait.start, strict=True)
+    joints = {name: others.get(name, Harmonics(angle, (), ())) for name, angle in still}
+    return replace(gait, joints=joints)
 
 
 @dataclass
@@ -233,7 +249,7 @@ def lab(
 
 def changed(text: str, more: str) -> str:
     """A configuration with some keys replaced or added."""
-    for block in filter(None, (b.strip() for b in more.split("["))):
+    for block in filter(None, re.split(r"^\[", more, flags=re.MULTILINE)):
         table, _, lines = block.partition("]")
         head = f"[{table}]\n"
         if head not in text:

@@ -1,0 +1,90 @@
+"""`agent.toml`: every mistake is told in one line, and `pup-agent` exits with 2."""
+
+from pathlib import Path
+
+import pytest
+from agents import CONFIG, changed
+
+from hardware_agent.cli import main
+from hardware_agent.config import Settings
+from pup.errors import InputError
+
+WHOLE = CONFIG.format(folder="/tmp/nowhere", protocol=1, clock="wall")
+
+
+def read(folder: Path, text: str) -> Settings:
+    file = folder / "agent.toml"
+    file.write_text(text)
+    return Settings.read(file)
+
+
+def test_a_configuration_is_read_and_the_rest_has_defaults(tmp_path: Path) -> None:
+    settings = read(tmp_path, WHOLE)
+    assert settings.bus.baud == 1_000_000 and settings.bus.gains is None
+    assert settings.state == tmp_path / "state"
+    assert settings.control.rate == 33.0 and settings.safety.temperature == 70.0
+
+
+MISTAKES = {
+    "an unknown key": (
+        "[bus]\nbaudrate = 1",
+        "bus.baudrate: unknown key",
+    ),
+    "an unknown table": ("[motors]\nx = 1", "motors: unknown key"),
+    "a text for a number": ('[bus]\nbaud = "fast"', "bus.baud: expected a whole number"),
+    "another protocol": ("[bus]\nprotocol = 3", "bus.protocol: 3; use one of 1, 2"),
+    "sync read with 1.0": ('[bus]\nread = "sync"', "Protocol 1.0 has read"),
+    "rotating sync read": (
+        '[bus]\nprotocol = 2\nread = "sync"\ndetail = "rotating"',
+        "bus.detail: a sync read",
+    ),
+    "two gains": ("[bus]\ngains = [32, 16]", "bus.gains: write P, I and D"),
+    "a gain too large": ("[bus]\ngains = [850, 0, 0]", "bus.gains: write P, I and D"),
+    "an IMU nowhere": ('[imu]\nport = ""', "imu.port: missing"),
+    "an axis twice": ('[imu]\naxes = ["x", "x", "z"]', "imu.axes: names an axis twice"),
+    "an angle of its own": ('[imu]\nroll = "tilt"', "imu.roll: 'tilt'; use heading"),
+    "a rate of nothing": ("[control]\nrate = 0", "control.rate: 0 is outside"),
+    "a text for true": ('[control]\nrealtime = "no"', "control.realtime: expected true or false"),
+    "a limit too hot": ("[safety]\ntemperature = 95", "safety.temperature: 95 is outside"),
+    "no voltage": ("[safety]\nvoltage = [15, 9]", "safety.voltage: write [least, largest]"),
+    "no hook": ('[distance]\nkind = "hook"', "distance.command: missing"),
+    "a gateway without keys": ('[link]\ngateway = "tcp://a:1"', "link.key: missing"),
+    "an odd gateway": (
+        '[link]\nkey = "a"\ngateway_key = "b"\ngateway = "http://a"',
+        "link.gateway: 'http://a'; write tcp://HOST:PORT",
+    ),
+}
+
+
+@pytest.mark.parametrize(("more", "told"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_told_in_one_line(tmp_path: Path, more: str, told: str) -> None:
+    with pytest.raises(InputError) as refused:
+        read(tmp_path, changed(WHOLE, more))
+    assert told in str(refused.value) and "\n" not in str(refused.value)
+    assert "agent.toml" in str(refused.value)
+
+
+@pytest.mark.parametrize("verb", ["run", "enable", "health", "disable", "stop"])
+def test_every_verb_refuses_it_with_2(
+    tmp_path: Path, verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "agent.toml"
+    file.write_text(WHOLE.replace("schema = 1", "schema = 9"))
+    assert main([verb, "--config", str(file)]) == 2
+    assert main([verb, "--config", str(tmp_path / "none.toml")]) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2 and all(line.startswith(f"pup-agent {verb}: ") for line in told)
+
+
+def test_nobody_listening_is_unhealthy_and_not_a_mistake(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "agent.toml").write_text(WHOLE)
+    assert main(["health", "--config", str(tmp_path / "agent.toml")]) == 1
+    assert "no agent answers" in capsys.readouterr().err
+
+
+def test_keys_are_made_once_and_secret(tmp_path: Path) -> None:
+    assert main(["keys", "op2", "--out", str(tmp_path / "keys")]) == 0
+    assert main(["keys", "op2", "--out", str(tmp_path / "keys")]) == 2
+    assert (tmp_path / "keys" / "op2.key_secret").stat().st_mode & 0o077 == 0

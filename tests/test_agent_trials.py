@@ -1,0 +1,301 @@
+"""At most one motion per trial, and no end that gets lost, whatever the link and the power do."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hardware_agent.journal import Journal
+from hardware_agent.trials import RESTARTED, TrialBook
+from pup.errors import InputError
+from pup.wire import (
+    Accepted,
+    Acknowledge,
+    Assign,
+    Body,
+    Cancel,
+    Finished,
+    Message,
+    Outcome,
+    Running,
+    decode,
+    encode,
+)
+
+
+def assign(trial: str = "t", attempt: int = 1, fence: int = 1) -> Assign:
+    return Assign("study", trial, attempt, fence, "p" * 64, (0.1, 1 / 3, -1.0), 14.0)
+
+
+def book(folder: Path) -> TrialBook:
+    return TrialBook(Journal(folder / "journal"))
+
+
+class PowerCutError(Exception):
+    """The agent is killed here."""
+
+
+@dataclass
+class World:
+    """An agent, a gateway and a link between them that does what it wants.
+
+    Attributes:
+      folder: of the agent's journal.
+      moved: motions that the robot began, by trial and attempt.
+      stored: ends that the gateway has.
+      outbox: messages under way to the gateway.
+      inbox: to the agent.
+      cut: journal entries until the power goes; None for never.
+    """
+
+    folder: Path
+    moved: Counter[tuple[str, int]] = field(default_factory=Counter)
+    stored: dict[tuple[str, int], Finished] = field(default_factory=dict)
+    told: Counter[tuple[str, int]] = field(default_factory=Counter)
+    fences: dict[tuple[str, int], int] = field(default_factory=dict)
+    outbox: list[Body] = field(default_factory=list)
+    inbox: list[Body] = field(default_factory=list)
+    cut: int | None = None
+
+    def __post_init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Power is back: everything but the journal is gone."""
+        journal = Journal(self.folder / "journal")
+        append = journal.append
+
+        def fragile(entry: dict[str, object]) -> None:
+            if self.cut == 0:
+                self.cut = None
+                raise PowerCutError
+            if self.cut is not None:
+                self.cut -= 1
+            append(entry)
+
+        self.cut = None
+        self.book = TrialBook(journal)
+        journal.append = fragile  # type: ignore[method-assign]
+        self.moving: Assign | None = None
+
+    def agent(self, body: Body) -> None:
+        """The agent gets a message."""
+        if isinstance(body, Assign):
+            self.outbox += self.book.assigned(body)
+        elif isinstance(body, Cancel):
+            answers, end = self.book.cancelled(body)
+            self.outbox += answers
+            if end and self.moving is not None:
+                self.outbox.append(self.book.finish(self.moving, Outcome.ABORTED, "cancelled"))
+                self.moving = None
+        elif isinstance(body, Acknowledge):
+            self.book.acknowledged(body)
+
+    def move(self) -> None:
+        """The robot begins the trial that there is."""
+        current = self.book.current
+        if current is None or self.book.running:
+            return
+        self.outbox.append(self.book.begin(current))
+        self.moved[current.trial, current.attempt] += 1
+        self.moving = current
+
+    def stand(self) -> None:
+        """It has ended."""
+        if self.moving is not None:
+            self.outbox.append(self.book.finish(self.moving, Outcome.SUCCEEDED, "fell", 0.5, 3.0))
+            self.moving = None
+
+    def gateway(self, body: Body) -> None:
+        """The gateway gets a message."""
+        if isinstance(body, Finished):
+            key = (body.trial, body.attempt)
+            if body.fence < self.fences.get(key, 0):
+                return  # of a time before the trial was handed out anew
+            if key not in self.stored:
+                self.stored[key] = body
+                self.told[key] += 1
+            self.inbox.append(Acknowledge("m", body.trial, body.attempt, body.fence))
+
+
+STEPS = st.one_of(
+    st.tuples(st.just("assign"), st.integers(0, 2), st.integers(1, 2), st.integers(0, 1)),
+    st.tuples(st.just("cancel"), st.integers(0, 2), st.integers(1, 2)),
+    st.tuples(st.just("deliver"), st.booleans(), st.integers(0, 30)),
+    st.tuples(st.just("drop"), st.booleans(), st.integers(0, 30)),
+    st.tuples(st.just("repeat"), st.booleans(), st.integers(0, 30)),
+    st.tuples(st.just("move")),
+    st.tuples(st.just("stand")),
+    st.tuples(st.just("resend")),
+    st.tuples(st.just("restart")),
+    st.tuples(st.just("cut"), st.integers(0, 3)),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(STEPS, max_size=60))
+def test_no_trial_moves_twice_and_every_end_is_told_once(steps: list[tuple[object, ...]]) -> None:
+    with TemporaryDirectory() as folder:
+        world = World(Path(folder))
+        for step in steps:
+            try:
+                _do(world, step)
+            except PowerCutError:
+                world.restart()
+        _settle(world)
+        assert all(count == 1 for count in world.moved.values())
+        assert all(count == 1 for count in world.told.values())
+        assert set(world.moved) <= set(world.stored), "an end was lost"
+        for key, finished in world.stored.items():
+            assert finished.state is not Outcome.SUCCEEDED or world.moved[key] == 1
+        assert not world.book.owed
+
+
+def _do(world: World, step: tuple[object, ...]) -> None:
+    kind, *rest = step
+    if kind in ("assign", "cancel"):
+        trial, attempt = f"t{rest[0]}", int(rest[1])  # type: ignore[call-overload]
+        key = (trial, attempt)
+        if kind == "assign":
+            world.fences[key] = max(1, world.fences.get(key, 0) + int(rest[2]))  # type: ignore
+            world.inbox.append(assign(trial, attempt, world.fences[key]))
+        elif key in world.fences:
+            world.inbox.append(Cancel(*key, world.fences[key]))
+    elif kind in ("deliver", "drop", "repeat"):
+        _pass(world, str(kind), *rest)  # type: ignore[arg-type]
+    elif kind == "resend":
+        world.outbox += world.book.owed
+    elif kind == "cut":
+        world.cut = int(rest[0])  # type: ignore[call-overload]
+    else:
+        {"move": world.move, "stand": world.stand, "restart": world.restart}[str(kind)]()
+
+
+def _pass(world: World, kind: str, up: bool, which: int) -> None:
+    """Deliver, lose or deliver without forgetting a message, in any order."""
+    queue = world.outbox if up else world.inbox
+    if not queue:
+        return
+    body = queue[which % len(queue)]
+    if kind != "repeat":
+        queue.remove(body)
+    if kind != "drop":
+        body = decode(encode(Message(body))).body
+        (world.gateway if up else world.agent)(body)
+
+
+def _settle(world: World) -> None:
+    """The link works again, for long enough."""
+    world.cut = None
+    for _ in range(6):
+        world.stand()
+        if world.moving is None and world.book.running:
+            world.restart()  # what ran when the power went
+        world.outbox += world.book.owed
+        while world.outbox or world.inbox:
+            for up, queue in ((True, world.outbox), (False, world.inbox)):
+                while queue:
+                    body = queue.pop(0)
+                    if up or isinstance(body, Acknowledge):
+                        (world.gateway if up else world.agent)(body)
+        if not world.book.owed:
+            return
+        # an end under an old fence is only told under the one that the gateway knows
+        for finished in world.book.owed:
+            key = (finished.trial, finished.attempt)
+            world.agent(assign(*key, world.fences[key]))
+
+
+def test_a_motion_that_the_power_cut_is_told_as_aborted(tmp_path: Path) -> None:
+    first = book(tmp_path)
+    first.assigned(assign())
+    first.begin(assign())
+    again = book(tmp_path)
+    assert again.current is None
+    (owed,) = again.owed
+    assert (owed.state, owed.reason) == (Outcome.ABORTED, RESTARTED)
+    assert again.assigned(assign()) == [owed]
+
+
+def test_a_trial_that_was_only_accepted_goes_on_after_a_restart(tmp_path: Path) -> None:
+    assert book(tmp_path).assigned(assign()) == [Accepted("t", 1, 1)]
+    again = book(tmp_path)
+    assert again.current == assign()
+    assert [e.state for e in again.entries()] == ["accepted"]
+
+
+def test_an_older_fence_gets_no_answer_and_a_newer_one_is_taken_over(tmp_path: Path) -> None:
+    trials = book(tmp_path)
+    trials.assigned(assign(fence=3))
+    assert trials.assigned(assign(fence=2)) == []
+    assert trials.cancelled(Cancel("t", 1, 2)) == ([], False)
+    assert trials.assigned(assign(fence=4)) == [Accepted("t", 1, 4)]
+    trials.begin(trials.current or assign())
+    assert trials.assigned(assign(fence=5)) == [Running("t", 1, 5)]
+    told = trials.finish(assign(), Outcome.SUCCEEDED, "fell", 0.4, 2.0)
+    assert told.fence == 5
+    trials.acknowledged(Acknowledge("m", "t", 1, 5))
+    assert trials.owed == []
+    (again,) = book(tmp_path).assigned(assign(fence=6))
+    assert isinstance(again, Finished) and (again.fence, again.distance) == (6, 0.4)
+
+
+def test_a_cancellation_that_overtakes_its_trial_holds(tmp_path: Path) -> None:
+    trials = book(tmp_path)
+    answers, end = trials.cancelled(Cancel("t", 1, 1))
+    assert not end and isinstance(answers[0], Finished)
+    assert trials.assigned(assign()) == answers
+    assert trials.current is None
+
+
+def test_one_trial_at_a_time_and_a_new_attempt_replaces_what_has_not_moved(tmp_path: Path) -> None:
+    trials = book(tmp_path)
+    trials.assigned(assign("a"))
+    assert trials.assigned(assign("b")) == []
+    assert trials.assigned(assign("a", attempt=2)) == [Accepted("a", 2, 1)]
+    assert trials.current == assign("a", attempt=2)
+    assert trials.assigned(assign("a", attempt=1, fence=1)) == trials.owed
+    trials.begin(assign("a", attempt=2))
+    assert trials.assigned(assign("a", attempt=3)) == []
+
+
+@given(st.integers(1, 400))
+@settings(max_examples=40, deadline=None)
+def test_a_journal_survives_being_cut_off_anywhere(cut: int) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder)
+        trials = book(path)
+        trials.assigned(assign())
+        trials.begin(assign())
+        trials.finish(assign(), Outcome.SUCCEEDED, "fell", 0.4, 2.0)
+        data = (path / "journal").read_bytes()
+        (path / "journal").write_bytes(data[: max(1, len(data) - cut)])
+        again = book(path)
+        again.assigned(assign("next"))
+        assert book(path).entries() == again.entries()
+
+
+def test_damage_in_the_middle_of_a_journal_is_refused(tmp_path: Path) -> None:
+    trials = book(tmp_path)
+    trials.assigned(assign())
+    trials.begin(assign())
+    file = tmp_path / "journal"
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        book(tmp_path)
+
+
+def test_a_journal_of_another_schema_is_refused(tmp_path: Path) -> None:
+    import zlib
+
+    text = json.dumps({"event": "journal", "schema": 2})
+    (tmp_path / "journal").write_text(f"{zlib.crc32(text.encode()):08x} {text}\n")
+    with pytest.raises(InputError, match="schema 1"):
+        book(tmp_path)
