@@ -7,6 +7,7 @@ from virtual_robots import DARWIN
 
 from hardware_agent.virtual.bno055 import LYING, euler
 from hardware_agent.virtual.drives import AMBIENT, TICK
+from hardware_agent.virtual.faults import Faults
 from hardware_agent.virtual.fleet import Fleet
 from hardware_agent.virtual.imu import multiply
 from hardware_agent.virtual.packets import Packet
@@ -236,6 +237,29 @@ def test_a_hand_holds_until_the_servos_do() -> None:
     assert robot.pose().position[2] > 0.3
 
 
+def test_a_reset_leaves_the_servos_orders_alone() -> None:
+    fleet = Fleet(DARWIN, (1, 2))
+    for _ in range(3):
+        fleet.reset()
+        assert np.array_equal(fleet.plant.drives.orders.goal, np.rint(ticks(np.stack([START] * 2))))
+        assert np.all(fleet.plant.qpos[:, 2] > 0.3)
+        fleet.command(np.stack([START] * 2), 0.3)
+
+
+def test_a_servo_whose_plug_was_pulled_comes_back_limp() -> None:
+    robot = VirtualRobot(DARWIN, 1)
+    robot.board.write(24, b"\x01")
+    servo = robot.servos[KNEE]
+    servo.write(24, b"\x01")
+    power = robot.plant.drives.orders.power
+    assert power[servo.at] == 1
+    faults = Faults(robot, 1)
+    faults.cause({"kind": "dead_servo", "id": servo.id})
+    assert power[servo.at] == 0
+    faults.clear()
+    assert (power[servo.at], servo.memory.get("torque_enable")) == (0, 0)
+
+
 def test_on_a_rope_the_torso_stays() -> None:
     robots = plant((1, 2), Hold.ROPE)
     before = robots.qpos[:, :7].copy()
@@ -280,9 +304,8 @@ def test_moving_speed_limits_the_goals_motion() -> None:
     robot.board.write(24, b"\x01")
     robot.reset(Hold.ROPE)
     servo = robot.servos[DARWIN.joint_names.index("head_pan")]
-    servo.write(24, b"\x01")
     servo.write(32, (50).to_bytes(2, "little"))  # 5.7 rpm = 0.597 rad/s
-    robot.advance(0.1)
+    servo.write(24, b"\x01")
     servo.write(30, (2048 + 400).to_bytes(2, "little"))
     start = servo.position
     robot.advance(0.5)

@@ -161,6 +161,15 @@ class Drives:
         self.moving.seen[rows] = self.read(angle)[rows]
         self.moving.goal[rows] = self.orders.goal[rows]
 
+    def engage(self, place: tuple[int, int], ticks: float) -> None:
+        """Begin to regulate: a limited goal sets out from where the servo is.
+
+        Args:
+          place: lane and joint.
+          ticks: what its encoder says.
+        """
+        self.moving.goal[place], self.moving.pace[place], self.moving.built[place] = ticks, 0.0, 0.0
+
     def read(self, angle: Array) -> Array:
         """What the encoders say of the joints' angles, rad: ticks."""
         ticks = np.rint(angle * (1 / TICK) + self.zero)
@@ -214,7 +223,7 @@ class Drives:
         if self._shaped:
             self._shape_goal()
         else:
-            now.goal = self.orders.goal
+            np.copyto(now.goal, self.orders.goal)
         error = now.goal - ticks
         now.trend += FILTER * (ticks - now.seen - now.trend)
         now.seen = ticks

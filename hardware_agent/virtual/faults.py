@@ -63,7 +63,7 @@ class Faults:
         self.robot.imu.alive, self.robot.imu.frozen = True, False
         self.robot.plant.drives.stuck.clear()
         for servo in self.robot.servos:
-            servo.alive = True
+            servo.plug(True)
         self.robot.cool()
         self.robot.battery()
 
@@ -85,10 +85,7 @@ class Faults:
 
     def _dead_servo(self, told: Mapping[str, Any], on: bool) -> None:
         """It neither answers nor holds."""
-        servo = self._servo(told)
-        servo.alive = not on
-        if on:
-            servo.drop()
+        self._servo(told).plug(not on)
 
     def _stuck_encoder(self, told: Mapping[str, Any], on: bool) -> None:
         servo = self._servo(told)

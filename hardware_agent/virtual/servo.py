@@ -110,9 +110,11 @@ class Servo(Device):
             self._order("power", 0.0)
         self.supplied = on
 
-    def drop(self) -> None:
-        """Go limp without a word."""
-        self._order("power", 0.0)
+    def plug(self, on: bool) -> None:
+        """Pull its plug, upon which it goes limp and silent, or put it back."""
+        if on != self.alive:
+            self.alive = on
+            self.restart()
 
     def watch(self, now: float) -> None:
         """Stop where the bus has been silent for too long; only firmware for 2.0 can.
@@ -124,6 +126,11 @@ class Servo(Device):
     def _shut_down(self) -> None:
         self.memory.put("torque_enable", 0)
         self._order("power", 0.0)
+
+    def _enable(self, on: bool) -> None:
+        if on and not self.plant.drives.orders.power[self.at]:
+            self.plant.drives.engage(self.at, self.position)
+        self._order("power", float(on))
 
     def _stay(self) -> None:
         """The goal becomes the present position."""
@@ -155,7 +162,7 @@ class Servo1(Servo):
         self._order("limit", most / 1023)
 
     def permit(self, register: Register, value: int) -> None:
-        """Goals are within the angle limits; torque stays off after a shutdown."""
+        """Goals are within the angle limits."""
         low, high = self.memory.get("cw_angle_limit"), self.memory.get("ccw_angle_limit")
         if register.name == "goal_position" and not low <= value <= high:
             raise RefusedError(Fault.LIMIT)
@@ -166,7 +173,7 @@ class Servo1(Servo):
             case "goal_position":
                 self._goal(value)
             case "torque_enable":
-                self._order("power", float(value))
+                self._enable(bool(value))
             case "torque_limit":
                 self._order("limit", value / 1023)
             case "p_gain":
@@ -282,7 +289,7 @@ class Servo2(Servo):
             case "goal_position":
                 self._goal(value - self.memory.get("homing_offset"))
             case "torque_enable":
-                self._order("power", float(value))
+                self._enable(bool(value))
             case "goal_pwm":
                 self._order("limit", abs(value) / self.FULL)
             case "position_p_gain":
