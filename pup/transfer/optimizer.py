@@ -85,7 +85,7 @@ class Search:
     def real(self, unit: Array) -> Array:
         """Etas of the box from those of the unit cube."""
         low, high = np.array(self.lower), np.array(self.upper)
-        return np.clip(low + unit * (high - low), low, high)
+        return np.asarray(np.clip(low + unit * (high - low), low, high))
 
     def _unit(self, eta: Array) -> Array:
         low, high = np.array(self.lower), np.array(self.upper)

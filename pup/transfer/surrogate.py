@@ -181,7 +181,7 @@ class _Fixed(Mean):
         return told.reshape(x.shape[:-1]) + self.offset(x)
 
 
-class _Modes(Kernel):  # type: ignore[misc]
+class _Modes(Kernel):
     """Covariance of landscapes that differ from their mean by the simulated modes."""
 
     def __init__(self, prior: Landscapes, scale: float) -> None:
