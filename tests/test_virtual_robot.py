@@ -335,3 +335,22 @@ def test_side_door_refuses_nonsense(one: Bench) -> None:
         answer = one.side(**told)
         assert not answer["ok"]
         assert "\n" not in answer["error"]
+
+
+def test_side_door_tells_when_servos_let_go(one: Bench) -> None:
+    one.sync_write(24, 1, dict.fromkeys(IDS, 1))
+    assert one.bulk_read([(1, 24, 1)]) == [1]
+    held = one.side("bus")
+    assert (held["holding"], held["power"]) == (20, 1.0)
+    before = time.monotonic()
+    one.sync_write(34, 2, dict.fromkeys(IDS, 102))
+    one.bulk_read([(1, 24, 1)])
+    soft = one.side("bus")
+    assert (soft["holding"], soft["power"]) == (20, pytest.approx(0.1, abs=0.001))
+    assert before < soft["holding_since"] < soft["clock"] <= time.monotonic()
+    one.sync_write(24, 1, dict.fromkeys(IDS, 0))
+    one.sync_write(34, 2, dict.fromkeys(IDS, 1023))
+    one.bulk_read([(1, 24, 1)])
+    limp = one.side("bus")
+    assert (limp["holding"], limp["power"]) == (0, 0.0)
+    assert limp["holding_since"] > soft["holding_since"]

@@ -76,12 +76,15 @@ class Server(AbstractContextManager["Server"]):
         self._heard = {self.link: 0.0, self.imu: 0.0}
         self._wire = {self.link: 0.0, self.imu: 0.0}
         self._epoch = time.monotonic()
+        self._held = self._holding()
+        self._held_since = self._goals_since = self._epoch
         self._lost = 0.0
         self._commands = {
             "reset": self._reset,
             "release": self._release,
             "pose": self._pose,
             "time": self._time,
+            "bus": self._bus,
             "wait": self._wait,
             "period": self._set_period,
             "fault": self._fault,
@@ -177,8 +180,11 @@ class Server(AbstractContextManager["Server"]):
             self._begin(self.link, packet.size, baud)
             for reply in replies:
                 self._send(self.link, self.faults.disturb(reply.data), reply.wait, baud)
-            if self.lock_step and self.robot.plant.ordered != before:
-                self.robot.advance(self.period)
+            if self.robot.plant.ordered != before:
+                self._goals_since = time.monotonic()
+                if self.lock_step:
+                    self.robot.advance(self.period)
+        self._note()
 
     def _hear_imu(self, data: bytes) -> None:
         if not self._fresh(self.imu):
@@ -203,6 +209,17 @@ class Server(AbstractContextManager["Server"]):
         self._wire[port] += (wait + BITS * len(data) / baud) / self.speed
         port.send(data, math.ceil(self._wire[port] / USB) * USB)
 
+    def _holding(self) -> tuple[int, float]:
+        """How many servos hold, and with what share of their power the strongest does."""
+        orders = self.robot.plant.drives.orders
+        return int(orders.power[0].sum()), float((orders.limit * orders.power)[0].max())
+
+    def _note(self) -> None:
+        """Note when it was that servos began or ceased to hold."""
+        holding = self._holding()
+        if holding != self._held:
+            self._held, self._held_since = holding, time.monotonic()
+
     def _plug(self) -> None:
         if self.faults.unplugged:
             self.link.pull()
@@ -224,6 +241,16 @@ class Server(AbstractContextManager["Server"]):
 
     def _time(self, told: Mapping[str, Any]) -> dict[str, Any]:
         return {"time": self.robot.time, "lock_step": self.lock_step, "lag": self._lost}
+
+    def _bus(self, told: Mapping[str, Any]) -> dict[str, Any]:
+        self._note()
+        return {
+            "clock": time.monotonic(),
+            "holding": self._held[0],
+            "power": self._held[1],
+            "holding_since": self._held_since,
+            "goals_since": self._goals_since,
+        }
 
     def _wait(self, told: Mapping[str, Any]) -> dict[str, Any]:
         if not self.lock_step:
