@@ -179,7 +179,7 @@ def _agree(first: Fit, second: Fit) -> bool:
     assert first.residual is not None
     least, apart = min(first.chi2, second.chi2), abs(first.chi2 - second.chi2)
     excess = least - len(first.residual)
-    if _noise_like(first) or _noise_like(second):
+    if _noise_like(first) and _noise_like(second):
         return True
     return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE)
 
