@@ -124,9 +124,9 @@ RIVALS: dict[str, tuple[Callable[[int], Session], str]] = {
 }
 
 
-def regrets(make: Callable[[int], Session], seed: int, noise: float) -> dict[str, Any]:
+def regrets(make: Callable[[int], Session], seed: int, noise: float, gap: float) -> dict[str, Any]:
     """Regret in percent after each look, and the seconds that a suggestion took."""
-    robot = landscapes.Robot.draw(seed, noise)
+    robot = landscapes.Robot.draw(seed, noise, gap)
     rng = np.random.default_rng((seed, 4))
     best, session = robot.optimum(), make(seed)
     found: dict[str, Any] = {}
@@ -148,6 +148,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--noise", type=float, default=0.05, help="m")
+    parser.add_argument("--gap", type=float, default=0.0, help="of a robot to its family, in eta")
     parser.add_argument("--only", nargs="+", default=list(RIVALS))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -163,7 +164,7 @@ def main() -> None:
             print(f"{name}: skipped, {package} is not installed")
             continue
         seeds = range(options.first, options.first + options.robots)
-        runs = [regrets(make, seed, options.noise) for seed in seeds]
+        runs = [regrets(make, seed, options.noise, options.gap) for seed in seeds]
         row: dict[str, Any] = {}
         for look in map(str, LOOKS):
             found = np.array([r[look] for r in runs])
@@ -183,7 +184,12 @@ def main() -> None:
         )
         print(f"{name}: {told}; suggestion p95 {row['seconds_p95']:.2f} s", flush=True)
         if options.out:
-            document = {"schema": 1, "robots": options.robots, "noise": options.noise}
+            document = {
+                "schema": 1,
+                "robots": options.robots,
+                "noise": options.noise,
+                "gap": options.gap,
+            }
             options.out.write_text(json.dumps(document | {"optimisers": table}, indent=1) + "\n")
 
 

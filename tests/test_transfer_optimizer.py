@@ -58,12 +58,13 @@ def test_the_same_question_has_the_same_answer_to_the_last_bit():
     assert suggest(search(eta, distance, seed=1), 13).eta != first.eta
 
 
-def test_the_first_trials_are_uniform_and_do_not_depend_on_what_walked():
+def test_the_first_trials_are_the_middle_and_uniform_and_do_not_depend_on_what_walked():
     for number in range(1, 6):
         a = suggest(search(np.zeros((number - 1, 3)), np.zeros(number - 1)), number)
         b = suggest(search(np.ones((number - 1, 3)), np.ones(number - 1)), number)
         assert a.eta == b.eta and a.purpose is Purpose.INITIAL
     drawn = np.array([suggest(search([], []), n).eta for n in range(1, 257)])
+    assert (drawn[0] == 0).all()
     assert np.abs(drawn.mean(axis=0)).max() < 0.02  # a Sobol sequence fills the box evenly
     assert np.abs(drawn.std(axis=0) - 1 / np.sqrt(3)).max() < 0.02
 

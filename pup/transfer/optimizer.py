@@ -1,9 +1,9 @@
 """Which eta to try next, and which to keep (paper, section V).
 
-A few uniform trials, or simulated rollouts in their place, then each trial where noisy expected
-improvement on the Gaussian process is largest; at the end the tried eta with the largest posterior
-mean, so that one lucky walk does not decide. Everything is a function of the data, the number of
-the trial and the seed: whoever is stopped and asks again is told the same.
+The middle of the box and a few uniform trials, or simulated rollouts in their place, then each
+trial where noisy expected improvement on the Gaussian process is largest; at the end the tried eta
+with the largest posterior mean, so that one lucky walk does not decide. Everything is a function of
+the data, the number of the trial and the seed: whoever is stopped and asks again is told the same.
 """
 
 import hashlib
@@ -42,7 +42,7 @@ class Search:
     Attributes:
       lower: of the box of eta.
       upper: likewise.
-      initial: uniform trials.
+      initial: trials before the search, uniform but for the first.
       seed: of everything random.
       eta: of the walks so far, shape (n, n_eta).
       distance: of them, m, shape (n,).
@@ -130,11 +130,11 @@ def suggest(search: Search, number: int) -> Decision:
     """
     began = time.perf_counter()
     if search.simulated is None and len(search.distance) < search.initial:
-        eta = search.real(_uniform(len(search.lower), search.seed, number)[None])[0]
+        eta = search.real(_initial(len(search.lower), search.seed, number)[None])[0]
         return Decision(
             tuple(eta.tolist()),
             Purpose.INITIAL,
-            f"uniform, walk {len(search.distance) + 1} of {search.initial}",
+            "the middle of the box" if number == 1 else f"uniform, before {search.initial} walks",
             len(search.distance),
             search.digest,
             seconds=time.perf_counter() - began,
@@ -219,10 +219,12 @@ def _decision(
     )
 
 
-def _uniform(n_eta: int, seed: int, number: int) -> Array:
-    """A point of a scrambled Sobol sequence: uniform, and far from the others."""
+def _initial(n_eta: int, seed: int, number: int) -> Array:
+    """The middle, then a scrambled Sobol sequence: uniform, and far from each other."""
+    if number == 1:
+        return np.full(n_eta, 0.5)
     drawn = qmc.Sobol(n_eta, rng=np.random.default_rng(seed)).random_base2(number.bit_length())
-    return np.asarray(drawn[number - 1])
+    return np.asarray(drawn[number - 2])
 
 
 def _candidates(n_eta: int, rng: np.random.Generator) -> Array:

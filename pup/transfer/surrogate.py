@@ -269,15 +269,17 @@ def _model(told: Told, prior: Landscapes | None, centre: float, scale: float) ->
         MaternKernel(
             nu=2.5,
             ard_num_dims=told.eta.shape[1],
-            lengthscale_prior=LogNormalPrior(np.log(0.5), 0.7),
-            lengthscale_constraint=GreaterThan(0.05),
+            lengthscale_prior=LogNormalPrior(0.0, 0.7),
+            lengthscale_constraint=GreaterThan(0.025),
         ),
-        outputscale_prior=GammaPrior(2.0, 2.0 if prior is None else 6.0),
+        outputscale_prior=GammaPrior(2.0, 6.0),
     )
-    matern.base_kernel.lengthscale = 0.5
+    matern.base_kernel.lengthscale = 1.0
     matern.outputscale = 1.0 if prior is None else 0.3
+    # Distances were scaled by their own deviation; how far a robot is off its prior is not known.
+    matern.raw_outputscale.requires_grad_(prior is not None)
     likelihood = GaussianLikelihood(
-        noise_prior=LogNormalPrior(np.log(0.05), 1.0), noise_constraint=GreaterThan(1e-4)
+        noise_prior=LogNormalPrior(-3.0, 1.0), noise_constraint=GreaterThan(1e-4)
     )
     likelihood.noise = 0.05
     model = SingleTaskGP(

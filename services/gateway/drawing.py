@@ -7,7 +7,7 @@ from html import escape
 from pup.transfer.study import Purpose, Study, Trial, TrialState
 from services.gateway.records import Row
 
-WIDTH, HEIGHT = 640, 260
+WIDTH, HEIGHT = 440, 220
 LEFT, RIGHT, TOP, BOTTOM = 48, 12, 14, 36
 
 
@@ -76,8 +76,11 @@ def progress(study: Study) -> str:
     step = max(1, last // 10)
     drawn = axes.frame("trial", "distance, m", range(1, last + 1, step))
     searched = [(t, d) for t, d in points if t.purpose in (Purpose.INITIAL, Purpose.SEARCH)]
-    farthest = [max(d for _, d in searched[: i + 1]) for i in range(len(searched))]
-    drawn.append(axes.line([t.number for t, _ in searched], farthest, "best"))
+    numbers, farthest = [], []
+    for i, (trial, _) in enumerate(searched):
+        numbers += [trial.number, searched[i + 1][0].number if i + 1 < len(searched) else last]
+        farthest += [max(d for _, d in searched[: i + 1])] * 2
+    drawn.append(axes.line(numbers, farthest, "best"))
     drawn += [_mark(axes, t, d) for t, d in points]
     return _svg(WIDTH, f"distances of {len(points)} walks", drawn)
 

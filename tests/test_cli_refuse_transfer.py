@@ -1,0 +1,173 @@
+"""The command line of serve and transfer: bad input ends with exit code 2, one clear line."""
+
+import json
+from pathlib import Path
+
+import agents
+import gateways
+import pytest
+from commandline import pup
+from refusals import Cases, Made, Place, assert_refused, check
+
+pytest.importorskip("fastapi")
+pytest.importorskip("botorch")
+
+case = Cases()
+KEPT = ("PUP_TOKEN", "PUP_DATA", "PUP_HOST", "PUP_PORT", "PUP_LINK", "PUP_DATABASE", "PUP_LOG")
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch):
+    for name in KEPT:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PUP_TOKEN", "pup_anything")
+
+
+def transfer(place: Place, *options: object) -> list[object]:
+    given = ["--study", "walk", "--url", f"http://127.0.0.1:{gateways.free_port()}"]
+    return ["transfer", *given, *options, "--out", place.out]
+
+
+def serve(place: Place, config: str, *options: object) -> list[object]:
+    return ["serve", *options, "--config", place.write("gateway.toml", config)]
+
+
+def bundle(place: Place) -> Path:
+    return agents.bundle(place.here / "policy")
+
+
+@case("a policy that is not there")
+def _(place: Place) -> Made:
+    return transfer(place, "--policy", place.here / "none"), ("none", "cannot be read")
+
+
+@case("a gateway that is not there")
+def _(place: Place) -> Made:
+    return transfer(place, "--policy", bundle(place)), ("no gateway answers", "pup serve")
+
+
+@case("an address that is none")
+def _(place: Place) -> Made:
+    return transfer(place, "--policy", bundle(place), "--url", "robot"), ("--url", "http://")
+
+
+@case("a name that is none")
+def _(place: Place) -> Made:
+    return transfer(place, "--policy", bundle(place), "--study", "a/b"), ("'a/b'", "no name")
+
+
+@case("a file of a token that is not there")
+def _(place: Place) -> Made:
+    options = ("--policy", bundle(place), "--token-file", "nowhere")
+    return transfer(place, *options), ("--token-file", "nowhere")
+
+
+@case("an empty token")
+def _(place: Place) -> Made:
+    file = place.write("token", "\n")
+    return transfer(place, "--policy", bundle(place), "--token-file", file), ("PUP_TOKEN",)
+
+
+@case("an eta to compare that is none")
+def _(place: Place) -> Made:
+    return transfer(place, "--policy", "x", "--compare", "a,b"), ("--compare", "'a,b'")
+
+
+@case("more trials than there can be")
+def _(place: Place) -> Made:
+    return transfer(place, "--policy", "x", "--trials", 5000), ("--trials", "1000")
+
+
+@case("simulated rollouts that are none")
+def _(place: Place) -> Made:
+    file = place.write("simulated.json", json.dumps({"schema": 2}))
+    return transfer(place, "--policy", bundle(place), "--simulated", file), (file, "schema 1")
+
+
+@case("a configuration that is not there")
+def _(place: Place) -> Made:
+    return ["serve", "--config", place.here / "none.toml"], ("none.toml", "cannot be read")
+
+
+@case("a configuration that is not TOML")
+def _(place: Place) -> Made:
+    return serve(place, "port = "), ("gateway.toml", "not TOML")
+
+
+@case("a key that is unknown")
+def _(place: Place) -> Made:
+    return serve(place, "prot = 1"), ("prot", "unknown", "port")
+
+
+@case("a port that is none")
+def _(place: Place) -> Made:
+    return serve(place, "port = 70000"), ("port", "'70000'", "65535")
+
+
+@case("a link that is none")
+def _(place: Place) -> Made:
+    return serve(place, 'link = "5555"'), ("link", "'5555'", "tcp://")
+
+
+@case("a certificate without its key")
+def _(place: Place) -> Made:
+    return serve(place, 'certificate = "c.pem"'), ("certificate", "key")
+
+
+@case("a level of log that is none")
+def _(place: Place) -> Made:
+    return serve(place, 'log = "loud"'), ("log", "'loud'", "warning")
+
+
+@case("all addresses without a token")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"\nhost = "0.0.0.0"'), ("no token", "pup serve token")
+
+
+@case("a database that is none")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"\ndatabase = "nosuch://x"\nlog = "error"'), (
+        "database",
+        "nosuch",
+    )
+
+
+@case("a token without a name")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"', "token"), ("token", "NAME")
+
+
+@case("a token with a name that is none")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"', "token", "../x"), ("'../x'", "no name")
+
+
+@case("a token that is not there to revoke")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"', "revoke-token", "ann"), ("no token ann",)
+
+
+@case("an agent without a folder")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"', "agent", "darwin"), ("--out",)
+
+
+@case("an agent that is not there to revoke")
+def _(place: Place) -> Made:
+    return serve(place, 'data = "service"', "revoke-agent", "darwin"), ("no agent darwin",)
+
+
+@pytest.mark.parametrize("name", list(case))
+def test_bad_input_is_refused(place: Place, name: str) -> None:
+    """Nothing is written."""
+    check(place, case[name](place))
+
+
+def test_a_token_that_is_no_operators_is_refused(tmp_path, monkeypatch):
+    policy = agents.bundle(tmp_path / "policy")
+    with gateways.running(tmp_path / "data") as service:
+        options = ("--policy", policy, "--study", "walk", "--url", service.url, "--out", tmp_path)
+        assert_refused(pup("transfer", *options), "bearer token")
+        monkeypatch.setenv("PUP_TOKEN", service.tokens["viewer"])
+        assert_refused(pup("transfer", *options), "role operator", "viewer")
+        assert not (tmp_path / "study.json").exists()
