@@ -43,7 +43,7 @@ SYNC_WRITE, BULK_READ = 0x83, 0x92
 STRICT = """[bus]
 timeout = 0.004
 [imu]
-timeout = 0.005
+timeout = 0.004
 [safety]
 late = 0.15
 stale = 0.02
@@ -199,12 +199,12 @@ CAUSES: dict[str, Cause] = {
 }
 
 
-def stops(repeats: int) -> dict[str, Any]:
+def stops(repeats: int, causes: str) -> dict[str, Any]:
     """Time from each cause to torque off on the bus, in control periods."""
     table = {}
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as name, tapped(Path(name)) as (made, tap):
-        for cause, act in CAUSES.items():
+        for cause, act in ((c, a) for c, a in CAUSES.items() if causes in c):
             took, others = [], 0
             while len(took) < repeats and others < repeats:
                 if made.agent is None or made.agent.poll() is not None:
@@ -246,10 +246,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     what = parser.add_subparsers(dest="what", required=True)
     what.add_parser("jitter").add_argument("--minutes", type=float, default=10.0)
-    what.add_parser("stops").add_argument("--repeats", type=int, default=100)
+    stop = what.add_parser("stops")
+    stop.add_argument("--repeats", type=int, default=100)
+    stop.add_argument("--cause", default="", help="only those whose name has this")
     options = parser.parse_args()
     load = os.getloadavg()[0]
-    told = jitter(options.minutes) if options.what == "jitter" else stops(options.repeats)
+    told = (
+        jitter(options.minutes)
+        if options.what == "jitter"
+        else stops(options.repeats, options.cause)
+    )
     machine = f"{os.cpu_count()} cores, {platform.processor() or platform.machine()}"
     print(
         json.dumps(

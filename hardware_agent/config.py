@@ -63,7 +63,6 @@ class ImuSettings:
       yaw: likewise.
       axes: sensor axes that point along the torso's x (forward), y (left) and z (up).
       timeout: largest delay of an answer beside its time on the wire, s.
-      tries: how often a tick asks.
     """
 
     kind: str = "none"
@@ -72,8 +71,7 @@ class ImuSettings:
     pitch: str = "pitch"
     yaw: str = "-heading"
     axes: tuple[str, ...] = ("y", "-x", "z")
-    timeout: float = 0.005
-    tries: int = 3
+    timeout: float = 0.004
 
 
 @dataclass(frozen=True)
@@ -286,7 +284,6 @@ LIMITS: Mapping[tuple[str, str], tuple[float, float]] = {
     ("BusSettings", "tries"): (1, 10),
     ("BusSettings", "board"): (0, 252),
     ("ImuSettings", "timeout"): (0.0005, 1.0),
-    ("ImuSettings", "tries"): (1, 10),
     ("ControlSettings", "rate"): (5.0, 500.0),
     ("ControlSettings", "ramp"): (0.5, 60.0),
     ("ControlSettings", "settle"): (0.0, 60.0),

@@ -26,6 +26,7 @@ UNITS, MODE = 0x3B, 0x3D
 CONFIG_MODE, IMU_MODE = 0x00, 0x08
 FIRST, LENGTH = 0x08, 24
 """Accelerometer, magnetometer, gyroscope and Euler angles in one stretch of registers."""
+TRIES = 3  # to configure it
 SWITCH = 0.03  # s that a change of the mode takes at most (datasheet, table 3-6)
 ACCEL, DEGREES = 0.01, 1 / 16  # m/s², and degrees or degrees/s, per count
 I2C_ADDRESS = 0x28
@@ -211,7 +212,7 @@ class Bno055:
             else:
                 raise BusError(f"{place}: no BNO055 answers")
             for register, value in ((MODE, CONFIG_MODE), (UNITS, 0), (MODE, IMU_MODE)):
-                if not any(self._wire.write(register, value) for _ in range(self._settings.tries)):
+                if not any(self._wire.write(register, value) for _ in range(TRIES)):
                     raise BusError(f"{place}: cannot be configured")
                 time.sleep(SWITCH)
         except FAILURES as error:
@@ -229,17 +230,16 @@ class Bno055:
             raise BusError(f"{self._settings.port}: {device_error(error)}") from error
 
     def take(self, board: bytes | None, now: float) -> Orientation | None:
-        """The answer, asked for again where it is refused or late."""
+        """The answer; asked for again where it is refused, which is quick, or did not come."""
         try:
-            for again in range(self._settings.tries):
-                if again:
-                    self._wire.ask(FIRST, LENGTH)
-                data = self._wire.take(LENGTH)
-                if data is not None:
-                    return self._read(data)
+            end = time.monotonic() + 1.5 * self._settings.timeout
+            while (data := self._wire.take(LENGTH)) is None:
+                if time.monotonic() > end:
+                    return None
+                self._wire.ask(FIRST, LENGTH)
         except FAILURES as error:
             raise BusError(f"{self._settings.port}: {device_error(error)}") from error
-        return None
+        return self._read(data)
 
     def _read(self, data: bytes) -> Orientation:
         counts = np.frombuffer(data, "<i2").astype(np.float64)

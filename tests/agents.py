@@ -54,7 +54,7 @@ gate = "auto"
 clock = "{clock}"
 source = "simulation"
 ramp = 0.5
-settle = 0.5
+settle = 1.0
 
 [safety]
 late = 1.0

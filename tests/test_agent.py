@@ -45,6 +45,7 @@ MODES = {
     "2.0, bulk": BusSettings("", protocol=2, write="bulk"),
     "2.0, sync": BusSettings("", protocol=2, read="sync"),
 }
+FAST = ("1.0", "2.0, bulk")
 
 
 def assign(policy: Path, trial: str = "t", horizon: float = 0.4) -> Assign:
@@ -74,7 +75,11 @@ def limp(made: Lab) -> bool:
     return told == {False}
 
 
-@pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
+@pytest.mark.parametrize(
+    "mode",
+    [pytest.param(m, marks=() if n in FAST else pytest.mark.slow) for n, m in MODES.items()],
+    ids=MODES,
+)
 def test_the_bus_speaks_both_protocols(tmp_path: Path, mode: BusSettings) -> None:
     """All servos told and asked at once; noise on the wire is asked over, not believed."""
     with lab(tmp_path, speed=1.0, protocol=mode.protocol) as made:
@@ -149,6 +154,7 @@ def test_trials_run_on_board_are_told_and_recorded(
         assert data == (folder / f"{fallen.recording}.parquet").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_policy_that_tells_nonsense_is_infeasible_and_the_robot_limp(tmp_path: Path) -> None:
     huge = 1.7e308  # sums of these are infinite, and their differences no number
     wild = standing(head_tilt=Harmonics(0.0, (huge, -huge), (huge, -huge)))
@@ -186,6 +192,7 @@ def test_a_cancelled_trial_stands_and_a_restart_never_repeats_a_motion(tmp_path:
         assert made.health()["state"] == "disabled"
 
 
+@pytest.mark.slow
 def test_starting_moves_nothing_and_enabling_holds_the_pose(tmp_path: Path) -> None:
     """The goal that the first torque meets is where the joints are."""
     with lab(tmp_path, speed=1.0) as made:
@@ -232,6 +239,7 @@ def test_killed_or_hung_the_robot_is_limp_soon(tmp_path: Path) -> None:
         assert "did not tick for 0.5 s" in made.log()
 
 
+@pytest.mark.slow
 def test_without_its_watchdog_the_agent_lets_go(tmp_path: Path) -> None:
     with lab(tmp_path, speed=1.0) as made:
         made.start()
@@ -282,6 +290,7 @@ def _enabled(made: Lab) -> bool:
     return made.health()["state"] == "enabled"
 
 
+@pytest.mark.slow
 def test_whoever_presses_it_the_robot_stops(tmp_path: Path) -> None:
     """A message, the command line, and a pin whose command ends; then it is enabled again."""
     button = '[stop]\ncommand = ["sleep", "1000"]\n'
@@ -314,6 +323,7 @@ def _command(pid: int) -> str:
     return Path(f"/proc/{pid}/cmdline").read_text()
 
 
+@pytest.mark.slow
 def test_the_operator_lets_trials_start_and_tells_distances(tmp_path: Path) -> None:
     policy = bundle(tmp_path / "policies" / "still")
     by_hand = '[control]\ngate = "operator"\n[distance]\nkind = "operator"\n'
