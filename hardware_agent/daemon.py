@@ -28,7 +28,7 @@ from hardware_agent.journal import Journal
 from hardware_agent.link import Link
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
-from hardware_agent.port import BusError
+from hardware_agent.port import BusError, BusyError
 from hardware_agent.systemd import notify
 from hardware_agent.trials import TrialBook
 from hardware_agent.watchdog import Watchdog
@@ -50,6 +50,7 @@ log = logging.getLogger("pup-agent")
 
 TURN = 0.05  # s, the longest sleep of the loop
 RESEND = 2.0  # s between two sendings of an end that is not acknowledged
+TAKEOVER = 5.0  # s that another process may still have the bus
 PATIENCE = 5.0  # s that a command waits for the loop
 
 
@@ -142,11 +143,20 @@ class Agent:
         }
 
     def _open(self) -> None:
-        try:
-            for told in self._body.open():
-                log.info("%s", told)
-        except BusError as error:  # it may be switched on later
-            log.warning("%s; trying again", error)
+        """Take the robot; the watchdog of an agent that was killed may have it for a moment."""
+        deadline = time.monotonic() + TAKEOVER
+        while True:
+            try:
+                for told in self._body.open():
+                    log.info("%s", told)
+            except BusyError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.2)
+                continue
+            except BusError as error:  # it may be switched on later
+                log.warning("%s; trying again", error)
+            return
 
     def _turn(self) -> None:
         """Sleep until something happens, and see to everything."""

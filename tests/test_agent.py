@@ -2,6 +2,7 @@
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -342,3 +343,22 @@ def test_the_operator_lets_trials_start_and_tells_distances(tmp_path: Path) -> N
         made.say("skip")
         wait(lambda: gateway.of(Finished)[-1].trial == "b", 20, made.log)
         assert gateway.of(Finished)[-1].state is Outcome.ABORTED
+
+
+@pytest.mark.slow
+def test_at_the_prompt_a_key_enables_and_any_other_stops(tmp_path: Path) -> None:
+    with lab(tmp_path, speed=1.0) as made:
+        made.start()
+        command = [sys.executable, "-m", "hardware_agent.cli", "operate", "--config"]
+        prompt, theirs = pty.openpty()
+        operator = subprocess.Popen(
+            [*command, str(made.config)], stdin=theirs, stdout=subprocess.DEVNULL
+        )
+        os.write(prompt, b"e")
+        made.until("enabled")
+        os.write(prompt, b" ")
+        assert made.until("stopped")["reason"] == "stop: by the operator"
+        os.write(prompt, b"q")
+        assert operator.wait(timeout=20) == 0
+        os.close(prompt)
+        os.close(theirs)
