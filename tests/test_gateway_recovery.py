@@ -275,6 +275,7 @@ def churn(service, study, trials, lives, seed, settings):
     return journal, told
 
 
+@pytest.mark.slow
 def test_a_real_gateway_killed_again_and_again(tmp_path):
     with gateways.running(tmp_path / "data") as service:
         settings = {"initial": 8, "repeats": 0, "failures": 50}
