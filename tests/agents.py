@@ -237,8 +237,8 @@ def lab(
         robot = subprocess.Popen(command, stderr=log, stdout=log)
     made = Lab(folder, robot)
     try:
-        side = folder / "side"
-        wait(lambda: side.exists() or robot.poll() is not None, 60)
+        doors = [folder / name for name in ("side", "bus", "imu")]
+        wait(lambda: all(d.exists() for d in doors) or robot.poll() is not None, 60)
         assert robot.poll() is None, (folder / "robot.log").read_text()
         yield made
     finally:
