@@ -199,8 +199,22 @@ CAUSES: dict[str, Cause] = {
 }
 
 
+REASONS = {
+    "e-stop by command": "stop: ",
+    "dead servo": "stale servo: l_knee",
+    "bus cable pulled": "stale servo: ",
+    "IMU silent": "stale IMU: ",
+    "hot servo": "over-temperature: ",
+    "under-voltage": "voltage: ",
+}
+
+
 def stops(repeats: int, causes: str) -> dict[str, Any]:
-    """Time from each cause to torque off on the bus, in control periods."""
+    """Time from each cause to torque off on the bus, in control periods.
+
+    A stop whose reason is another than the cause's is not counted: on a busy machine the virtual
+    robot is at times too late with its answers.
+    """
     table = {}
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as name, tapped(Path(name)) as (made, tap):
@@ -217,11 +231,24 @@ def stops(repeats: int, causes: str) -> dict[str, Any]:
                 count, before = len(tap.offs), time.monotonic()
                 act(made)
                 wait(lambda n=count: len(tap.offs) > n, 10, made.log)  # type: ignore[misc]
-                took.append((tap.offs[count] - before) / PERIOD)
+                if _is_why(made, cause):
+                    took.append((tap.offs[count] - before) / PERIOD)
+                else:
+                    others += 1
                 _mend(made)
             table[cause] = _row(took) | {"tripped_by_itself": others}
             print(cause, json.dumps(table[cause]), file=sys.stderr, flush=True)
     return table
+
+
+def _is_why(made: Lab, cause: str) -> bool:
+    """Whether the agent stopped the robot for this cause; one that is dead cannot say."""
+    assert made.agent is not None
+    if cause not in REASONS or made.agent.poll() is not None:
+        return True
+    told = made.health
+    wait(lambda: bool(told()["reason"]), 10, made.log)
+    return str(told()["reason"]).startswith(REASONS[cause])
 
 
 def _mend(made: Lab) -> None:

@@ -83,7 +83,7 @@ class Bus:
             if self.settings.board is not None:
                 self._power(self.settings.board)
             self.torque(False)
-            missing = [name for name in self.ids if self._packets.ping(self._use(), name)[1]]
+            missing = [name for name in self.ids if self._register(name, (0, 2)) is None]
             if missing:
                 told = ", ".join(map(str, missing))
                 raise BusError(f"{self.settings.port}: no answer from servo {told}")
@@ -176,16 +176,14 @@ class Bus:
         if self.registers.hardware_error is None:
             return ""
         with self._told():
-            address, length = self.registers.hardware_error
-            data, result, _ = self._packets.readTxRx(self._use(), name, address, length)
-        return hardware_alarm(data[0]) if result == COMM_SUCCESS else ""
+            bits = self._register(name, self.registers.hardware_error)
+        return "" if bits is None else hardware_alarm(bits)
 
     def torque_enabled(self, name: int) -> bool | None:
         """Whether a servo holds; None when it does not answer."""
         with self._told():
-            address, length = self.registers.torque_enable
-            data, result, _ = self._packets.readTxRx(self._use(), name, address, length)
-        return bool(data[0]) if result == COMM_SUCCESS else None
+            told = self._register(name, self.registers.torque_enable)
+        return None if told is None else bool(told)
 
     def _detailed(self) -> Collection[int]:
         """Who tells more than its position: all, or one after the other."""
@@ -294,8 +292,8 @@ class Bus:
     def _set_up(self, name: int) -> Iterator[str]:
         """Put a limp servo's lasting settings right."""
         own, packets = self.registers, self._packets
-        model, result, _ = packets.read2ByteTxRx(self._use(), name, 0)
-        if result == COMM_SUCCESS and model != own.model:
+        model = self._register(name, (0, 2))
+        if model != own.model:
             raise InputError(
                 f"{self.settings.port}: servo {name} is of model {model}, not an MX-28 with "
                 f"Protocol {own.protocol}.0 (model {own.model}); see [bus] protocol"
@@ -304,10 +302,20 @@ class Bus:
             ("return delay", own.return_delay, 0),
             ("status return level", own.status_level, 2),
         ):
-            data, result, _ = packets.readTxRx(self._use(), name, *span)
-            if result == COMM_SUCCESS and data[0] != wanted:
+            known = self._register(name, span)
+            if known != wanted:
                 packets.writeTxRx(self._use(), name, *span, [wanted])
-                yield f"servo {name}: {told} {data[0]} made {wanted}"
+                if self._register(name, span) != wanted:
+                    raise BusError(f"{self.settings.port}: servo {name} keeps {told} {known}")
+                yield f"servo {name}: {told} {known} made {wanted}"
+
+    def _register(self, name: int, span: Span) -> int | None:
+        """A register of one servo; None when it does not answer, however often it is asked."""
+        for _ in range(self.settings.tries):
+            data, result, _ = self._packets.readTxRx(self._use(), name, *span)
+            if result == COMM_SUCCESS and len(data) == span[1]:
+                return int.from_bytes(bytes(data), "little")
+        return None
 
     def _use(self) -> Port:
         """The port, free: with one owner and one thread, nobody else can be using it."""

@@ -1,5 +1,6 @@
 """The prompt of whoever stands at the robot: starts trials, stops the robot, types distances."""
 
+import os
 import select
 import sys
 import termios
@@ -27,7 +28,16 @@ def operate(socket: Path) -> int:
     """
     if not sys.stdin.isatty():
         raise InputError("this is no terminal; use `pup-agent arm`, `stop` and `distance`")
-    print(HELP)
+    while True:
+        with _keys():
+            print(HELP, flush=True)
+            if not _watch(socket):
+                return 0
+        _measure(socket)
+
+
+def _watch(socket: Path) -> bool:
+    """Show what happens and do what keys say; True for a distance to type, False to leave."""
     shown = ""
     while True:
         told = say(socket, {"do": "health"})
@@ -39,11 +49,10 @@ def operate(socket: Path) -> int:
             if asked == "arm":
                 print("ENTER starts the trial, s skips it")
         if asked == "distance":
-            _measure(socket)
-            continue
+            return True
         key = _key()
         if key and _press(socket, key, asked):
-            return 0
+            return False
 
 
 def _press(socket: Path, key: str, asked: str) -> bool:
@@ -73,13 +82,13 @@ def _measure(socket: Path) -> None:
 
 def _key() -> str:
     """A key that is pressed within a moment; empty for none."""
-    with _raw():
-        ready, _, _ = select.select([sys.stdin], [], [], LOOK)
-        return sys.stdin.read(1) if ready else ""
+    ready, _, _ = select.select([sys.stdin.fileno()], [], [], LOOK)
+    return os.read(sys.stdin.fileno(), 1).decode(errors="replace") if ready else ""
 
 
 @contextmanager
-def _raw() -> Iterator[None]:
+def _keys() -> Iterator[None]:
+    """Keys come one by one, as they are pressed: none must get lost that should stop the robot."""
     before = termios.tcgetattr(sys.stdin)
     try:
         tty.setcbreak(sys.stdin)

@@ -352,13 +352,15 @@ def test_at_the_prompt_a_key_enables_and_any_other_stops(tmp_path: Path) -> None
         command = [sys.executable, "-m", "hardware_agent.cli", "operate", "--config"]
         prompt, theirs = pty.openpty()
         operator = subprocess.Popen(
-            [*command, str(made.config)], stdin=theirs, stdout=subprocess.DEVNULL
+            [*command, str(made.config)], stdin=theirs, stdout=subprocess.PIPE
         )
+        assert operator.stdout is not None and b"STOPS" in operator.stdout.readline()
         os.write(prompt, b"e")
         made.until("enabled")
         os.write(prompt, b" ")
         assert made.until("stopped")["reason"] == "stop: by the operator"
         os.write(prompt, b"q")
         assert operator.wait(timeout=20) == 0
+        operator.stdout.close()
         os.close(prompt)
         os.close(theirs)
