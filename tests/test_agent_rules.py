@@ -251,13 +251,13 @@ def test_the_boards_own_sensors_find_the_tilt() -> None:
 
 
 def test_ticks_that_were_missed_are_left_out_and_counted() -> None:
-    metronome, never = Metronome(0.02), threading.Event()
+    metronome, never = Metronome(0.1), threading.Event()
     origin = metronome.wait(never)
-    time.sleep(0.07)
+    time.sleep(0.35)
     times = [metronome.wait(never) for _ in range(3)]
-    beats = [(t - origin) / 0.02 for t in times]
+    beats = [(t - origin) / 0.1 for t in times]
     assert beats[0] == pytest.approx(4, abs=0.5), "the next beat, not those gone by"
-    assert np.diff(times).min() > 0.01, "no burst"
+    assert np.diff(times).min() > 0.05, "no burst"
     assert metronome.timing().missed == 3
 
 

@@ -217,7 +217,7 @@ def test_an_operator_holds_the_gate(service):
         assert walked == [("gated/1", 1), ("gated/2", 2)]
 
 
-def until(true, seconds=20):
+def until(true, seconds=90):
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it does not come true"
