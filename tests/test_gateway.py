@@ -89,7 +89,7 @@ def test_a_study_is_made_once_and_joined(service):
         {"lower": [1, 1, 1]},
         {"lower": [0, 0]},
         {"compare": [[0, 0]]},
-        {"initial": 99},
+        {"initial": 0},
         {"unknown": 1},
         {"gate": "none"},
         {"seed": -1},
@@ -124,6 +124,8 @@ def test_what_is_not_there_is_told(service):
         is_problem(http.post("/v1/agents/nobody:stop", json={"reason": "x"}), 404)
         is_problem(http.get("/v1/none"), 404)
         is_problem(http.put("/v1/studies"), 405)
+        assert http.options("/v1/studies").headers["allow"] == "GET, POST"
+        assert http.get("/v1/studies/x:pause").headers["allow"] == "POST"
 
 
 def test_the_same_key_is_carried_out_once(service):
@@ -134,7 +136,7 @@ def test_the_same_key_is_carried_out_once(service):
         assert (again.status_code, again.content) == (first.status_code, first.content)
         assert again.headers["idempotent-replayed"] == "true"
         other = http.post("/v1/studies", json=asked | {"name": "other"}, headers=key)
-        assert "another request" in is_problem(other, 422)
+        assert "another request" in is_problem(other, 409)
         assert http.get("/v1/studies/other").status_code == 404
         is_problem(
             http.post("/v1/studies", json=asked, headers={"Idempotency-Key": "x" * 200}), 422

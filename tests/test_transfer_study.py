@@ -139,9 +139,10 @@ def test_results_of_what_was_never_handed_out_are_unknown(ticket):
     assert trial.finish(ticket, Result(S.SUCCEEDED, 0.7)) == (trial, Verdict.UNKNOWN)
 
 
-def test_a_success_without_a_distance_is_no_data_point():
+@pytest.mark.parametrize("distance", [None, 1e9, -1e300, float("nan")])
+def test_a_success_without_a_distance_that_can_be_is_no_data_point(distance):
     trial, ticket = handed_out()
-    trial, _ = trial.finish(ticket, Result(S.SUCCEEDED))
+    trial, _ = trial.finish(ticket, Result(S.SUCCEEDED, distance))
     assert trial.state is S.ABORTED and "distance" in trial.result.reason
 
 
@@ -240,7 +241,7 @@ def test_failures_in_a_row_are_counted():
         {"compare": ((0.0,),)},
         {"compare": ((0.0, 0.0, float("nan")),)},
         {"initial": 0},
-        {"initial": 26},
+        {"trials": 0},
     ],
 )
 def test_wrong_settings_are_refused(wrong):

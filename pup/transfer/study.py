@@ -54,6 +54,9 @@ OPEN = (S.REQUESTED, *HANDED_OUT)
 TOLD = (S.SUCCEEDED, S.INFEASIBLE)
 """What the Gaussian process hears of."""
 
+FARTHEST = 1000.0
+"""Distance beyond which a measurement is a mistake, m."""
+
 
 class Purpose(StrEnum):
     """Why a trial is made.
@@ -154,8 +157,8 @@ class StudySettings:
             raise InputError("lower and upper must be finite")
         if any(len(eta) != n or not all(map(math.isfinite, eta)) for eta in self.compare):
             raise InputError(f"each eta in compare needs {n} finite numbers")
-        if not 1 <= self.initial <= self.trials:
-            raise InputError(f"initial is {self.initial}; use 1 to trials, {self.trials}")
+        if min(self.trials, self.initial) < 1:
+            raise InputError("trials and initial must be 1 or more")
 
 
 @dataclass(frozen=True)
@@ -250,12 +253,14 @@ class Trial:
         return replace(self, state=state), Verdict.COUNTED
 
     def finish(self, ticket: Ticket, result: Result) -> tuple["Trial", Verdict]:
-        """Hear how it ended. A success without a distance is no result of eta: aborted."""
+        """Hear how it ended. A success without a distance that can be is no result of eta."""
         verdict = self._judge(ticket)
         if verdict is not Verdict.COUNTED:
             return self, verdict
-        if result.state is S.SUCCEEDED and result.distance is None:
-            result = replace(result, state=S.ABORTED, reason="no distance was measured")
+        far = math.inf if result.distance is None else abs(result.distance)
+        if result.state is S.SUCCEEDED and not far <= FARTHEST:
+            why = f"no distance that can be was measured: {result.distance}"
+            result = replace(result, state=S.ABORTED, reason=why)
         return replace(self, state=result.state, result=result), Verdict.COUNTED
 
     def expire(self) -> "Trial":

@@ -99,7 +99,7 @@ class IdempotentRoute(APIRoute):
             try:
                 if before := await store.answer(key, user.name):
                     if before.request != digest:
-                        raise HTTPException(422, "this Idempotency-Key had another request")
+                        raise HTTPException(409, "this Idempotency-Key had another request")
                     headers = {"Idempotent-Replayed": "true"}
                     return Response(before.body, before.status, headers, "application/json")
                 response = await handle(request)

@@ -16,7 +16,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from pup.transfer import orders
 from pup.transfer.study import Study, StudySettings
-from services.gateway import pages, problems
+from services.gateway import names, pages, problems
 from services.gateway.access import BODY_LIMIT, IdempotencyKey, IdempotentRoute, needs
 from services.gateway.conductor import Conductor
 from services.gateway.keys import Role, Tokens, User
@@ -37,20 +37,19 @@ from services.gateway.shapes import (
 )
 from services.gateway.store import Store
 
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$"
 STREAM = 15.0
 """Between two signs of life of a stream of events, s."""
 
-StudyName = Annotated[str, Path(pattern=NAME, description="Name of a study.")]
-AgentName = Annotated[str, Path(pattern=NAME, description="Name of an agent.")]
+StudyName = Annotated[str, Path(pattern=names.WHOLE, description="Name of a study.")]
+AgentName = Annotated[str, Path(pattern=names.WHOLE, description="Name of an agent.")]
 Number = Annotated[int, Path(ge=1, le=10**9, description="Of a trial in its study, from 1.")]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 After = Annotated[str, Query(max_length=64, description="The last name of the page before.")]
 Viewer = Annotated[User, needs(Role.VIEWER)]
 Operator = Annotated[User, needs(Role.OPERATOR)]
 
-READ = responses(401, 403, 404, 422)
-WRITE = responses(401, 403, 404, 409, 413, 422)
+READ = responses(400, 401, 403, 404, 422)
+WRITE = responses(400, 401, 403, 404, 409, 411, 413, 422)
 v1 = APIRouter(prefix="/v1", route_class=IdempotentRoute)
 
 
@@ -152,7 +151,7 @@ async def create_study(
     return _json(study_document(study), 201 if new else 200, Location=place)
 
 
-@v1.get("/studies/{study}", response_model=StudyShape, responses=READ)
+@v1.get("/studies/{study:name}", response_model=StudyShape, responses=READ)
 async def get_study(request: Request, _: Viewer, study: StudyName) -> Response:
     """One study."""
     conductor = _conductor(request)
@@ -160,7 +159,7 @@ async def get_study(request: Request, _: Viewer, study: StudyName) -> Response:
     return _json(study_document(found) | {"waits_for": conductor.waits_for(found)})
 
 
-@v1.get("/studies/{study}/trials", response_model=TrialList, responses=READ)
+@v1.get("/studies/{study:name}/trials", response_model=TrialList, responses=READ)
 async def list_trials(
     request: Request,
     _: Viewer,
@@ -174,13 +173,13 @@ async def list_trials(
     return _json({"trials": told, "next": after + limit if len(trials) > limit else None})
 
 
-@v1.get("/studies/{study}/posterior", response_model=Posterior, responses=READ)
+@v1.get("/studies/{study:name}/posterior", response_model=Posterior, responses=READ)
 async def get_posterior(request: Request, _: Viewer, study: StudyName) -> Response:
     """The Gaussian process: what would be chosen now, and slices through it."""
     return _json(await _conductor(request).posterior(study))
 
 
-@v1.get("/studies/{study}/history", response_model=EventList, responses=READ)
+@v1.get("/studies/{study:name}/history", response_model=EventList, responses=READ)
 async def list_events(
     request: Request,
     _: Viewer,
@@ -196,7 +195,7 @@ async def list_events(
 
 
 @v1.get(
-    "/studies/{study}/events",
+    "/studies/{study:name}/events",
     responses=READ | {200: {"content": {"text/event-stream": {}}}},
     response_class=StreamingResponse,
 )
@@ -206,7 +205,7 @@ async def stream_study(request: Request, _: Viewer, study: StudyName) -> Respons
     return _stream(request, study)
 
 
-@v1.post("/studies/{study}:pause", response_model=StudyShape, responses=WRITE)
+@v1.post("/studies/{study:name}:pause", response_model=StudyShape, responses=WRITE)
 async def pause_study(
     request: Request, user: Operator, study: StudyName, why: Reason, key: IdempotencyKey = None
 ) -> Response:
@@ -217,7 +216,7 @@ async def pause_study(
     )
 
 
-@v1.post("/studies/{study}:resume", response_model=StudyShape, responses=WRITE)
+@v1.post("/studies/{study:name}:resume", response_model=StudyShape, responses=WRITE)
 async def resume_study(
     request: Request, user: Operator, study: StudyName, key: IdempotencyKey = None
 ) -> Response:
@@ -227,7 +226,9 @@ async def resume_study(
     return _json(study_document(told))
 
 
-@v1.post("/studies/{study}/trials/{number}:release", response_model=TrialShape, responses=WRITE)
+@v1.post(
+    "/studies/{study:name}/trials/{number:int}:release", response_model=TrialShape, responses=WRITE
+)
 async def release_trial(
     request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
 ) -> Response:
@@ -237,7 +238,9 @@ async def release_trial(
     return _trial(told, number)
 
 
-@v1.post("/studies/{study}/trials/{number}:retry", response_model=TrialShape, responses=WRITE)
+@v1.post(
+    "/studies/{study:name}/trials/{number:int}:retry", response_model=TrialShape, responses=WRITE
+)
 async def retry_trial(
     request: Request,
     user: Operator,
@@ -252,7 +255,9 @@ async def retry_trial(
     return _trial(told, number)
 
 
-@v1.post("/studies/{study}/trials/{number}:cancel", response_model=TrialShape, responses=WRITE)
+@v1.post(
+    "/studies/{study:name}/trials/{number:int}:cancel", response_model=TrialShape, responses=WRITE
+)
 async def cancel_trial(
     request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
 ) -> Response:
@@ -281,7 +286,7 @@ async def stream_agents(request: Request, _: Viewer) -> Response:
     return _stream(request, "")
 
 
-@v1.post("/agents/{agent}:stop", status_code=202, responses=WRITE)
+@v1.post("/agents/{agent:name}:stop", status_code=202, responses=WRITE)
 async def stop_agent(
     request: Request, user: Operator, agent: AgentName, why: Reason, key: IdempotencyKey = None
 ) -> Response:

@@ -1,16 +1,15 @@
 """The pages: studies, one study as it goes on, agents. No script or style from elsewhere."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Request
-from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment, PackageLoader, select_autoescape
 from markupsafe import Markup
 
-from services.gateway import drawing
+from services.gateway import drawing, names  # noqa: F401 - names makes {study:name} known
 from services.gateway.access import COOKIE, asking
 from services.gateway.conductor import Conductor
 from services.gateway.keys import Role, Tokens, User
@@ -30,7 +29,6 @@ _templates = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-Name = Annotated[str, InPath(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")]
 
 
 def _page(
@@ -86,9 +84,9 @@ async def studies(request: Request) -> Response:
     return _page("studies.html", request, user, studies=told)
 
 
-@router.get("/studies/{study}")
-@router.get("/studies/{study}/live")
-async def one(request: Request, study: Name) -> Response:
+@router.get("/studies/{study:name}")
+@router.get("/studies/{study:name}/live")
+async def one(request: Request, study: str) -> Response:
     """A study; `live` is the part that changes."""
     if (user := asking(request)) is None:
         return _login(request)

@@ -7,8 +7,10 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
+from starlette.routing import Route
 
 from pup.errors import InputError
 from pup.transfer.study import TrialError
@@ -49,12 +51,21 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+def _allowed(app: FastAPI, path: str) -> set[str]:
+    """Methods of all routes at a path; the framework tells those of the first one alone."""
+    routes = [r for r in app.routes if isinstance(r, Route | APIRoute)]
+    return {m for r in routes if r.path_regex.match(path) for m in r.methods or ()}
+
+
 def handle(app: FastAPI) -> None:
     """Let an application tell its errors so."""
 
     @app.exception_handler(HTTPException)
     async def of_http(request: Request, error: HTTPException) -> JSONResponse:
-        return problem(error.status_code, str(error.detail), request, **(error.headers or {}))
+        headers = dict(error.headers or {})
+        if error.status_code == 405:
+            headers["Allow"] = ", ".join(sorted(_allowed(app, request.url.path)))
+        return problem(error.status_code, str(error.detail), request, **headers)
 
     @app.exception_handler(RequestValidationError)
     async def of_validation(request: Request, error: RequestValidationError) -> JSONResponse:

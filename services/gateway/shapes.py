@@ -5,12 +5,15 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from pup.errors import InputError
 from pup.transfer.study import Gate, Purpose, StudyState, TrialState
 from pup.transfer.study import StudySettings as Defaults
+from services.gateway.names import WHOLE
 from services.gateway.records import Row
 
-Eta = Annotated[list[FiniteFloat], Field(min_length=1, max_length=16)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")]
+Number = Annotated[FiniteFloat, Field(ge=-1e6, le=1e6)]
+Eta = Annotated[list[Number], Field(min_length=1, max_length=16)]
+Name = Annotated[str, Field(pattern=WHOLE)]
 ROLLOUTS = 2**16
 
 
@@ -25,7 +28,7 @@ class SimulatedRollouts(Strict):
 
     eta: Annotated[list[Eta], Field(min_length=2, max_length=4096)]
     distance: Annotated[
-        list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=4096)]],
+        list[Annotated[list[Number], Field(min_length=2, max_length=4096)]],
         Field(min_length=1, max_length=4096),
     ]
 
@@ -35,8 +38,6 @@ class SimulatedRollouts(Strict):
         Raises:
           InputError: they are not.
         """
-        from pup.errors import InputError
-
         widths = {len(eta) for eta in self.eta} | {n_eta}
         lengths = {len(row) for row in self.distance} | {len(self.eta)}
         if len(widths) > 1 or len(lengths) > 1:
