@@ -27,6 +27,7 @@ from hardware_agent.registers import (
 from pup.errors import InputError
 
 POWER_UP = 0.3  # s until servos answer after the board gave them current (e-manual)
+PAUSE = 0.02  # s after a silence: an answer says not to which question, and may only be late
 WRITES = 2  # of a command that must arrive: a noise pulse may spoil one packet
 ERROR = {1: 4, 2: 8}
 """Place of the error byte in a status packet, by protocol; parameters follow."""
@@ -276,18 +277,14 @@ class Bus:
             raise BusError(f"{self.settings.port}: {self._packets.getTxRxResult(result)}")
 
     def _power(self, board: int) -> None:
-        address, length = BOARD_POWER
-        power, result, _ = self._one.readTxRx(self._use(), board, address, length)
-        if result != COMM_SUCCESS:
+        """Let the board, which speaks Protocol 1.0 whatever the servos speak, give them current."""
+        packets = PacketHandler(1.0)
+        power = self._ask_one(packets, board, BOARD_POWER)
+        if power is None:
             raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
-        if power[0] != 1:
-            self._one.writeTxRx(self._use(), board, address, length, [1])
+        if power != 1:
+            packets.writeTxRx(self._use(), board, *BOARD_POWER, [1])
             time.sleep(POWER_UP)
-
-    @property
-    def _one(self) -> PacketHandler:
-        """The board speaks Protocol 1.0 whatever the servos speak."""
-        return PacketHandler(1.0)
 
     def _set_up(self, name: int) -> Iterator[str]:
         """Put a limp servo's lasting settings right."""
@@ -311,10 +308,14 @@ class Bus:
 
     def _register(self, name: int, span: Span) -> int | None:
         """A register of one servo; None when it does not answer, however often it is asked."""
+        return self._ask_one(self._packets, name, span)
+
+    def _ask_one(self, packets: PacketHandler, name: int, span: Span) -> int | None:
         for _ in range(self.settings.tries):
-            data, result, _ = self._packets.readTxRx(self._use(), name, *span)
-            if result == COMM_SUCCESS and len(data) == span[1]:
+            data, result, _ = packets.readTxRx(self._use(), name, *span)
+            if result == COMM_SUCCESS:
                 return int.from_bytes(bytes(data), "little")
+            time.sleep(PAUSE)
         return None
 
     def _use(self) -> Port:

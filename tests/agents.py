@@ -194,8 +194,8 @@ class Lab:
             self.agent.wait(timeout=30)
 
     def log(self) -> str:
-        file = self.folder / "agent.log"
-        return file.read_text() if file.exists() else ""
+        files = [self.folder / name for name in ("robot.log", "agent.log")]
+        return "\n".join(file.read_text()[-3000:] for file in files if file.exists())
 
     def until(self, state: str, seconds: float = 20.0) -> dict[str, Any]:
         """Wait for a state of the robot."""
@@ -243,7 +243,7 @@ def lab(
         yield made
     finally:
         made.end()
-        robot.send_signal(signal.SIGTERM)
+        robot.kill()  # it has nothing to lose, and the folder is the test's
         robot.wait(timeout=20)
 
 
