@@ -3,7 +3,7 @@
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from dataclasses import fields
 from functools import partial
 from importlib.metadata import version
@@ -13,6 +13,7 @@ from fastapi import APIRouter, FastAPI, HTTPException, Path, Query, Request
 from fastapi.responses import PlainTextResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pup.transfer import orders
 from pup.transfer.study import Study, StudySettings
@@ -21,6 +22,7 @@ from services.gateway.access import BODY_LIMIT, IdempotencyKey, IdempotentRoute,
 from services.gateway.conductor import Conductor
 from services.gateway.keys import Role, Tokens, User
 from services.gateway.link import Link
+from services.gateway.metrics import Metrics
 from services.gateway.problems import problem, responses
 from services.gateway.records import settings_of, study_document, trial_document
 from services.gateway.shapes import (
@@ -76,7 +78,7 @@ def application(store: Store, tokens: Tokens, conductor: Conductor, link: Link |
     app.include_router(pages.router)
     app.mount("/static", StaticFiles(directory=pages.STATIC), name="static")
     problems.handle(app)
-    app.middleware("http")(_guarded)
+    app.add_middleware(_Guard, metrics=conductor.metrics)
     made = app.openapi
 
     def openapi() -> dict[str, Any]:
@@ -89,26 +91,49 @@ def application(store: Store, tokens: Tokens, conductor: Conductor, link: Link |
     return app
 
 
-async def _guarded(request: Request, handle: Callable[[Request], Awaitable[Response]]) -> Response:
-    """Refuses bodies that are too large, measures, and forbids browsers what pages do not need."""
-    began = time.perf_counter()
-    length = request.headers.get("Content-Length", "0" if request.method == "GET" else "")
-    if "transfer-encoding" in request.headers or (request.method == "POST" and not length):
-        response: Response = problem(411, "a Content-Length is needed", request)
-    elif length.isdecimal() and int(length) > BODY_LIMIT:
-        response = problem(413, f"more than {BODY_LIMIT} bytes", request)
-    else:
-        response = await handle(request)
-    metrics = request.app.state.conductor.metrics
-    spent = time.perf_counter() - began
-    metrics.requests.labels(request.method, response.status_code).observe(spent)
-    response.headers["X-Content-Type-Options"] = "nosniff"
-    response.headers["Referrer-Policy"] = "no-referrer"
-    response.headers.setdefault("Cache-Control", "no-store")
-    response.headers["Content-Security-Policy"] = (
-        "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'self'"
+class _Guard:
+    """Refuses bodies that are too large, measures, and forbids browsers what pages do not need.
+
+    Plain ASGI: the framework's own kind of middleware takes as long as a whole answer.
+    """
+
+    HEADERS = (
+        (b"x-content-type-options", b"nosniff"),
+        (b"referrer-policy", b"no-referrer"),
+        (b"cache-control", b"no-store"),
+        (
+            b"content-security-policy",
+            b"default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
+        ),
     )
-    return response
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self.app, self.metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        began, method = time.perf_counter(), scope["method"]
+
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", ()), *self.HEADERS]
+                spent = time.perf_counter() - began
+                self.metrics.requests.labels(method, message["status"]).observe(spent)
+            await send(message)
+
+        refusal = self._refusal(scope)
+        await (refusal or self.app)(scope, receive, sending)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        told = dict(scope["headers"])
+        length = told.get(b"content-length", b"" if scope["method"] == "POST" else b"0")
+        if b"transfer-encoding" in told or not length.isdigit():
+            return problem(411, "a Content-Length is needed", Request(scope))
+        if int(length) > BODY_LIMIT:
+            return problem(413, f"more than {BODY_LIMIT} bytes", Request(scope))
+        return None
 
 
 def _conductor(request: Request) -> Conductor:

@@ -7,10 +7,9 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
-from starlette.routing import Route
+from starlette.routing import Match
 
 from pup.errors import InputError
 from pup.transfer.study import TrialError
@@ -19,6 +18,7 @@ from services.gateway.conductor import UnknownError
 log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
+METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
 
 
 class Problem(BaseModel):
@@ -51,10 +51,14 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
-def _allowed(app: FastAPI, path: str) -> set[str]:
-    """Methods of all routes at a path; the framework tells those of the first one alone."""
-    routes = [r for r in app.routes if isinstance(r, Route | APIRoute)]
-    return {m for r in routes if r.path_regex.match(path) for m in r.methods or ()}
+def _allowed(request: Request) -> list[str]:
+    """Methods that some route takes at a path; the framework tells those of the first one alone."""
+
+    def taken(method: str) -> bool:
+        scope = {**request.scope, "method": method}
+        return any(route.matches(scope)[0] is Match.FULL for route in request.app.routes)
+
+    return [method for method in METHODS if taken(method)]
 
 
 def handle(app: FastAPI) -> None:
@@ -64,7 +68,7 @@ def handle(app: FastAPI) -> None:
     async def of_http(request: Request, error: HTTPException) -> JSONResponse:
         headers = dict(error.headers or {})
         if error.status_code == 405:
-            headers["Allow"] = ", ".join(sorted(_allowed(app, request.url.path)))
+            headers["Allow"] = ", ".join(_allowed(request))
         return problem(error.status_code, str(error.detail), request, **headers)
 
     @app.exception_handler(RequestValidationError)
