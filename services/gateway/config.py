@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pup.errors import InputError
+from services.gateway.keys import KeyRing, Tokens
 
 PREFIX = "PUP_"
+DATABASE_FILE = "PUP_DATABASE_FILE"
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,11 @@ class Config:
       host: that REST and pages are served at; loopback unless told otherwise.
       port: likewise.
       link: ZeroMQ address for agents.
-      database: URL of SQLAlchemy; empty for SQLite in `data`.
+      database: URL of SQLAlchemy; empty for SQLite in `data`. `PUP_DATABASE_FILE` names a file that
+        holds it, for one with a password.
+      tokens: file of the tokens; empty for `tokens.json` in `data`.
+      curve: folder of the gateway's CURVE keys; empty for `curve` in `data`.
+      agents: folder of the agents' public keys; empty for `agents` in that of the CURVE keys.
       certificate: file with the certificate of TLS; empty for none.
       key: file with its secret key.
       log: least level that is logged, `debug`, `info`, `warning` or `error`.
@@ -32,6 +38,9 @@ class Config:
     port: int = 8470
     link: str = "tcp://127.0.0.1:8471"
     database: str = ""
+    tokens: str = ""
+    curve: str = ""
+    agents: str = ""
     certificate: str = ""
     key: str = ""
     log: str = "info"
@@ -55,6 +64,8 @@ class Config:
         if unknown := sorted(set(told) - names):
             known = ", ".join(sorted(names))
             raise InputError(f"{file}: {unknown[0]} is unknown; there are {known}")
+        if DATABASE_FILE in environment:
+            told["database"] = _held(Path(environment[DATABASE_FILE]))
         for name in names & {n.removeprefix(PREFIX).lower() for n in environment}:
             if PREFIX + name.upper() in environment:
                 told[name] = environment[PREFIX + name.upper()]
@@ -64,6 +75,17 @@ class Config:
     def url(self) -> str:
         """Of the database."""
         return self.database or f"sqlite:///{(self.data / 'gateway.db').absolute()}"
+
+    @property
+    def token_store(self) -> Tokens:
+        """Who may ask."""
+        return Tokens(Path(self.tokens) if self.tokens else self.data / "tokens.json")
+
+    @property
+    def key_ring(self) -> KeyRing:
+        """The CURVE keys."""
+        folder = Path(self.curve) if self.curve else self.data / "curve"
+        return KeyRing(folder, Path(self.agents) if self.agents else None)
 
     @property
     def loopback(self) -> bool:
@@ -95,3 +117,10 @@ class Config:
         if bool(config.certificate) != bool(config.key):
             raise InputError("certificate and key belong together; give both or none")
         return config
+
+
+def _held(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{DATABASE_FILE}: {file} cannot be read ({error})") from error

@@ -124,14 +124,16 @@ class KeyRing:
 
     Attributes:
       folder: `curve/`.
+      agents_elsewhere: folder of the agents' public keys; None for `curve/agents/`.
     """
 
     folder: Path
+    agents_elsewhere: Path | None = None
 
     @property
     def agents_folder(self) -> Path:
         """The folder with the agents' public keys."""
-        return self.folder / "agents"
+        return self.agents_elsewhere or self.folder / "agents"
 
     def gateway(self) -> tuple[bytes, bytes]:
         """Public and secret key of the gateway; made at the first time."""

@@ -57,7 +57,7 @@ def serve(config: Config) -> dict[str, Any]:
     for name in ("alembic", "zmq", "asyncio"):
         logging.getLogger(name).setLevel("WARNING")
     config.data.mkdir(parents=True, exist_ok=True)
-    tokens, ring = Tokens(config.data / "tokens.json"), KeyRing(config.data / "curve")
+    tokens, ring = config.token_store, config.key_ring
     if not len(tokens):
         if not config.loopback:
             raise InputError("no token exists; make one first: pup serve token NAME --role admin")

@@ -6,7 +6,7 @@ from typing import Any
 
 from pup.errors import InputError
 from services.gateway.config import Config
-from services.gateway.keys import KeyRing, Role, Tokens
+from services.gateway.keys import Role
 
 
 def serve(options: argparse.Namespace) -> dict[str, Any]:
@@ -26,13 +26,13 @@ def _run(config: Config, _: argparse.Namespace) -> dict[str, Any]:
 
 def _token(config: Config, options: argparse.Namespace) -> dict[str, Any]:
     name, role = _name(options), Role[options.role.upper()]
-    token = Tokens(config.data / "tokens.json").create(name, role)
+    token = config.token_store.create(name, role)
     return {"name": name, "role": options.role, "token": token}
 
 
 def _revoke_token(config: Config, options: argparse.Namespace) -> dict[str, Any]:
     name = _name(options)
-    Tokens(config.data / "tokens.json").revoke(name)
+    config.token_store.revoke(name)
     return {"revoked": name}
 
 
@@ -40,13 +40,13 @@ def _agent(config: Config, options: argparse.Namespace) -> dict[str, Any]:
     name = _name(options)
     if options.out is None:
         raise InputError("agent: give --out DIR, the folder for the files that go to the robot")
-    files = KeyRing(config.data / "curve").create_agent(name, Path(options.out))
+    files = config.key_ring.create_agent(name, Path(options.out))
     return {"name": name, "key": str(files[0]), "gateway_key": str(files[1])}
 
 
 def _revoke_agent(config: Config, options: argparse.Namespace) -> dict[str, Any]:
     name = _name(options)
-    KeyRing(config.data / "curve").revoke_agent(name)
+    config.key_ring.revoke_agent(name)
     return {"revoked": name}
 
 
