@@ -19,9 +19,10 @@ from pup.files import write_json
 from pup.locomotion.sampling import MARGIN
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.locomotion.task import WalkingTask
-from pup.policy.bundle import NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
+from pup.policy.bundle import CARD, NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
 from pup.policy.losses import LossWeights
 from pup.policy.mirror import MirrorMap
+from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
@@ -59,7 +60,8 @@ class Options:
       length: control steps of each between two updates.
       learning: how the networks are moved; what follows from the rest is filled in.
       runners: processes that sample; 0 for none beside this one.
-      start: bundle whose weights are trained further; None draws weights.
+      start: bundle whose weights are trained further, perhaps of other bounds of the same
+        parameters; None draws weights.
       track: other places that are told the curve, `wandb` and `mlflow`.
     """
 
@@ -156,6 +158,7 @@ class _Job:
             task.bins,
         )
         self.card = self._card(task)
+        self.origin: dict[str, Any] | None = None
         self.first = self._first()
         self.iterations = math.ceil(options.steps / self._per_iteration())
         self.learning = replace(
@@ -226,6 +229,7 @@ class _Job:
         steps = self.rows[-1]["steps"]
         provenance = {
             "options": self._told_options(),
+            "start": self.origin,
             "steps": steps,
             "seconds": round(self.seconds, 1),
             "engine": engine(),
@@ -273,7 +277,13 @@ class _Job:
                 f"{folder}: a {card.method} policy of other sizes or parameters; start from a "
                 f"{self.options.method} policy trained on bounds of the same parameters"
             )
-        return dict(weights)
+        self.origin = {
+            "policy_sha256": hashlib.sha256((folder / CARD).read_bytes()).hexdigest(),
+            "bounds_sha256": card.bounds_sha256,
+            "other_bounds": card.bounds_sha256 != self.bounds_sha256,
+            "steps": card.provenance.get("steps"),
+        }
+        return dict(for_bounds(card, weights, self.bounds.lower, self.bounds.upper))
 
     def _card(self, task: WalkingTask) -> PolicyCard:
         robot, settings = self.robot, self.settings
@@ -338,6 +348,7 @@ class _Job:
             "curve": columns,
             "provenance": {
                 "options": self._told_options(),
+                "start": self.origin,
                 "bounds": str(self.source),
                 "bounds_sha256": self.bounds_sha256,
                 "robot_digest": self.robot.digest,

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pup.errors import InputError
 from pup.policy.bundle import NumpyPolicy, PolicyCard, read_bundle, write_bundle
 from pup.policy.mirror import MirrorMap
+from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
 
@@ -280,6 +281,33 @@ def test_numpy_torch_and_onnx_pick_the_same_bins(tmp_path: Path, method: Method)
     np.testing.assert_array_equal(by_numpy, by_torch)
     np.testing.assert_array_equal(by_numpy, by_onnx)
     assert len(np.unique(by_numpy)) == 11
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_other_bounds_change_the_scale_and_not_the_policy(method: Method) -> None:
+    """The same physical mu gives the same logits and value; the same bounds the same bits."""
+    policy = policy_of(method)
+    card, rng = card_of(policy, method), np.random.default_rng(3)
+    weights = weights_of(policy)
+    own = np.array(card.parameter_lower), np.array(card.parameter_upper)
+    same = for_bounds(card, weights, *own)
+    assert same.keys() == weights.keys()
+    assert all(np.array_equal(same[name], weights[name]) for name in weights)
+    lower, upper = np.array([0.2, 1.0, 0.7, 0.9]), np.array([1.1, 2.0, 0.8, 0.9])
+    width = np.where(upper > lower, upper - lower, 1.0)
+    moved = ProjectedPolicy(policy.shape)
+    moved.load_state_dict(
+        {k: torch.from_numpy(v) for k, v in for_bounds(card, weights, lower, upper).items()}
+    )
+    mu = rng.uniform(0.6, 1.4, (200, 4))
+    seen = torch.from_numpy(observations(200)[0])
+    before = torch.from_numpy(((mu - own[0]) / (own[1] - own[0])).astype(np.float32))
+    after = torch.from_numpy(((mu - lower) / width).astype(np.float32))
+    same_to_the_policy = [lambda p, unit: p(seen, unit), lambda p, unit: p.value(seen, unit)]
+    if method is Method.PUP:  # the eta of UP is mu on the scale of the bounds
+        same_to_the_policy.append(lambda p, unit: p.project(unit))
+    for told in same_to_the_policy:
+        torch.testing.assert_close(told(policy, before), told(moved, after), rtol=1e-4, atol=2e-3)
 
 
 def test_a_bundle_is_read_as_it_was_written(bundle: Path) -> None:
