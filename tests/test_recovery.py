@@ -66,6 +66,7 @@ def test_what_a_suspended_robot_cannot_tell_is_said_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(7200)
 @pytest.mark.parametrize("actuator", ["nn_pd", "pd"])
 def test_whole_robot_is_recovered(tmp_path: Path, actuator: str) -> None:
     """Steps, stand-ups and falls of the whole robot, its network known."""

@@ -17,6 +17,12 @@ CLIP = 5.0
 """Standard deviations at which normalised observations end (the authors' filter)."""
 FLOOR = 1e-6
 """Least variance; an entry that never changes stays near 0."""
+SPREAD = 0.7
+"""Standard deviation, in bins, of the actions of a policy that has learnt nothing, about the middle.
+
+With all bins alike the noise of 20 joints throws the robot before what one of them did can be told
+from chance: after 0.4 M steps it falls after 1.1 s, with 1.0 after 5.5 s, with 0.7 after 8 s.
+"""
 
 
 class Normaliser(torch.nn.Module):
@@ -74,6 +80,7 @@ class ProjectedPolicy(torch.nn.Module):
         self.actor = _layers(
             shape.proprioception + shape.eta, shape.hidden, shape.bins * shape.joints, 0.01
         )
+        self.actor[-1].bias.data = _about_the_middle(shape).flatten()
         self.critic = _layers(shape.proprioception + shape.privileged, shape.hidden, 1, 1.0)
 
     def project(self, parameters: Tensor) -> Tensor:
@@ -144,6 +151,12 @@ def log_probability(log: Tensor, bins: Tensor) -> Tensor:
       bins: shape (n, joints).
     """
     return log.gather(-2, bins[..., None, :]).sum(dim=(-2, -1))
+
+
+def _about_the_middle(shape: PolicyShape) -> Tensor:
+    """Logits of a bell over the bins, alike for all joints, shape (bins, joints)."""
+    off = torch.arange(shape.bins) - (shape.bins - 1) / 2
+    return (-(off**2) / (2 * SPREAD**2))[:, None].repeat(1, shape.joints)
 
 
 def _layers(inputs: int, hidden: Sequence[int], outputs: int, last: float) -> torch.nn.Sequential:
