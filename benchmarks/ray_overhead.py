@@ -5,7 +5,8 @@ workers, in turn. Ray's start is told apart: it is paid once per job. Under `pro
 seconds of all processes together, which hardly depend on what else the machine does.
 
 (b) One fit of all suspended recordings, and several of subsets at once, by an embedded Ray of one
-core and of two, in turn.
+core and of two, in turn. Beside it what the machine has to give: two processes that share nothing
+but its memory, each with a fit of its own, against one of them alone.
 
 (c) Costs measured here (candidates at once, the search's own steps, Ray's time per task), played
 through by an event simulation to 32 workers. Efficiency is the speed-up over one worker divided by
@@ -18,11 +19,13 @@ do to the two runners would be compared.
 
 import heapq
 import itertools
+import multiprocessing
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.synchronize import Event, Semaphore
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -64,6 +67,7 @@ def main() -> None:
     recordings = suspended + ground
     few = suspended[:FEW]
     report.add("against_local", _against_local(robot, few, given.rounds, report))
+    report.add("machine", _two_processes(robot, few, given.rounds, report))
     report.add("two_against_one", _two_against_one(robot, suspended, given.rounds, report))
     report.add("simulated", _to_32(robot, recordings, report))
     report.finish()
@@ -123,6 +127,39 @@ def _two_against_one(
     return found
 
 
+def _two_processes(
+    robot: RobotDescription, recordings: tuple[Recording, ...], rounds: int, report: Report
+) -> dict[str, object]:
+    seconds = [_separately(robot, recordings, count) for count in (1, 2) * rounds]
+    speedup = ratio([2 * s for s in seconds[::2]], seconds[1::2])
+    report.say(f"(b) two separate processes without Ray against one: {speedup} times as fast")
+    return {"speedup": asdict(speedup), "seconds": seconds}
+
+
+def _separately(robot: RobotDescription, recordings: tuple[Recording, ...], count: int) -> float:
+    """Seconds of as many fits, each in a process of its own."""
+    spawn = multiprocessing.get_context("spawn")
+    begin, ready = spawn.Event(), spawn.Semaphore(0)
+    fits = [_fit(robot, recordings, seed, threads=1) for seed in range(count)]
+    processes = [spawn.Process(target=_alone, args=(fit, ready, begin)) for fit in fits]
+    for process in processes:
+        process.start()
+    for _ in processes:
+        ready.acquire()
+    wall = time.perf_counter()
+    begin.set()
+    for process in processes:
+        process.join()
+    return time.perf_counter() - wall
+
+
+def _alone(fit: Fit, ready: Semaphore, begin: Event) -> None:
+    _run(LocalRunner(), [_short(fit)])
+    ready.release()
+    begin.wait()
+    _run(LocalRunner(), [fit])
+
+
 def _fit(
     robot: RobotDescription, recordings: tuple[Recording, ...], seed: int, threads: int
 ) -> Fit:
@@ -172,7 +209,6 @@ class Costs:
     task: float
 
     def seconds(self, candidates: int) -> float:
-        """How long a task of so many candidates takes."""
         """What a task of some candidates takes."""
         return self.fixed + self.candidate * candidates
 
