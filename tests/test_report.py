@@ -1,157 +1,28 @@
-"""The report of pre-sysID and the overlays: structure, numbers, words and hostile input."""
+"""The report of pre-sysID: structure, numbers, words and hostile input."""
 
 import base64
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
 
-from pup.physics.parameters import NETWORK_NAMES, robot_space
-from pup.physics.simulator import Trajectories, tick_slices
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid import wording
-from pup.sysid.accuracy import JointUnits, accuracy
-from pup.sysid.bounds import Split
 from pup.sysid.html import tag
-from pup.sysid.loss import LOST_POSITION, ReplayLoss
-from pup.sysid.overlays import Overlays, by_motion, write_overlays
-from pup.sysid.report import write_report
+from pup.sysid.loss import ReplayLoss
+from pup.sysid.overlays import write_overlays
 from pup.sysid.result import Bounds, SubsetFit
-
-VOID = {"img", "meta"}
-TICKS = 12
-ROLL = np.full(TICKS, 3.1)
-
-
-class Page(HTMLParser):
-    """A page taken apart: elements with their attributes, tables as rows of cells, text."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str]]] = []
-        self.tables: list[list[list[str]]] = []
-        self.row_classes: list[list[str]] = []
-        self.text = ""
-        self.open: list[str] = []
-        self.source = path.read_text(encoding="utf-8")
-        self.feed(self.source)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {key: value or "" for key, value in attrs}
-        self.elements.append((tag, given))
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "table":
-            self.tables.append([])
-            self.row_classes.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-            self.row_classes[-1].append(given.get("class", ""))
-        elif tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if "style" in self.open:
-            return
-        self.text += data
-        if "td" in self.open or "th" in self.open:
-            self.tables[-1][-1][-1] += data
-
-    def all(self, tag: str) -> list[dict[str, str]]:
-        return [attributes for name, attributes in self.elements if name == tag]
-
-    def table(self, heading: str) -> list[list[str]]:
-        return next(t for t in self.tables if t[0][0] == heading)
+from tests.reports import Page, make_bounds, make_recording, make_replay, report, tilt
 
 
 @pytest.fixture(scope="module")
 def robot() -> RobotDescription:
     return RobotDescription.load("darwin_op2")
-
-
-def make_recording(robot: RobotDescription, name: str, **changes: object) -> Recording:
-    """Steps of 0.3 rad on every joint but the last of several, followed late."""
-    step = np.where(np.arange(TICKS) >= 2, 0.3, 0.0)
-    target = np.repeat(step[:, None], len(robot.joints), axis=1)
-    target[:, 1:][:, -1:] = 0.0
-    late = np.vstack([target[:1], target[:-1]])
-    fields: dict[str, object] = {
-        "id": name,
-        "robot": robot.name,
-        "motion": "step",
-        "support": "suspended",
-        "source": "simulation",
-        "joints": robot.joint_names,
-        "time": 5.0 + 0.05 * np.arange(TICKS),
-        "target": target,
-        "position": late,
-    }
-    return Recording(**(fields | changes))  # type: ignore[arg-type]
-
-
-def tilt(pitch: float) -> dict[str, np.ndarray]:
-    return {"imu/roll": np.zeros(TICKS), "imu/pitch": np.linspace(0, pitch, TICKS)}
-
-
-def make_replay(loss: ReplayLoss, robot: RobotDescription, off: float) -> Trajectories:
-    """Off by as much at every joint, but twice as far at the first and half at the second."""
-    position = np.nan_to_num(loss.position)[None] + off
-    position[..., 0] += off
-    position[..., 1:2] -= off / 2
-    feet = np.zeros((1, position.shape[1], len(robot.feet), 3))
-    return Trajectories(loss.ticks, position, np.nan_to_num(loss.tilt)[None] + off, feet)
-
-
-def make_bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> Bounds:
-    full = robot_space(robot, "nn_pd")
-    space = full.select([n for n in full.names if n not in NETWORK_NAMES])
-    count = len(space)
-    rng = np.random.default_rng(3)
-    contact = np.arange(8) < 4
-    unit = np.clip(0.5 + 0.05 * rng.normal(size=(8, count)), 0, 1)
-    fits = space.denormalise(unit)
-    splits = tuple(
-        Split(name, fits[contact, i], fits[~contact, i], 0.1, 0.7, 0.4)
-        for i, name in enumerate(space.names)
-    )
-    correlation = np.eye(count)
-    correlation[0, 5] = correlation[5, 0] = 0.95
-    identified = np.ones(count, dtype=bool)
-    identified[1] = False
-    return Bounds(
-        robot=robot.name,
-        actuator="nn_pd",
-        space=space,
-        nominal=space.denormalise(np.linspace(0.0, 0.8, count)),
-        lower=fits.min(axis=0),
-        upper=fits.max(axis=0),
-        ci90=space.denormalise(np.linspace([0.2, 0.3], [0.6, 0.9], count).T).T,
-        identified=identified,
-        correlation=correlation,
-        weights=np.zeros(27),
-        train={"loss": 1.2, "rmse": 0.0401, "rmse_before": 0.0912},
-        held_out={"loss": 1.5, "rmse": 0.0522, "folds": 3},
-        subsets=tuple(
-            SubsetFit((recordings[0].id,), bool(c), 1.0, f)
-            for c, f in zip(contact, fits, strict=True)
-        ),
-        splits=splits,
-        histories={"nn_pd": np.array([9.0, 2.0, 1.2]), "pd": np.array([4.0, 3.0, 2.9])},
-        omitted=("no standing recording: foot term left out",),
-        provenance={"seed": 7, "versions": {"mujoco": "4.0.0"}},
-    )
 
 
 @pytest.fixture(scope="module")
@@ -166,20 +37,6 @@ def recordings(robot: RobotDescription) -> tuple[Recording, ...]:
 @pytest.fixture(scope="module")
 def bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> Bounds:
     return make_bounds(robot, recordings)
-
-
-def report(
-    folder: Path,
-    bounds: Bounds,
-    robot: RobotDescription,
-    recordings: tuple[Recording, ...],
-    offsets: Mapping[str, float] | None = None,
-) -> Page:
-    loss = ReplayLoss(robot, recordings)
-    offsets = {"NN-PD": 0.01, "PD": 0.02} if offsets is None else offsets
-    replays = {label: make_replay(loss, robot, off) for label, off in offsets.items()}
-    write_report(folder / "report.html", bounds, robot, recordings, replays, loss)
-    return Page(folder / "report.html")
 
 
 @pytest.fixture(scope="module")
@@ -443,146 +300,3 @@ def test_why_there_is_no_test(
     told = wording.split_words(untested, recordings)
     assert told.startswith("Could not be tested because ") and reason in told
     assert not wording.split_meaning(untested)
-
-
-def test_gaps_and_broken_simulations(
-    tmp_path: Path, bounds: Bounds, robot: RobotDescription
-) -> None:
-    position = np.zeros((TICKS, len(robot.joints)))
-    position[4:, 3] = np.nan
-    target = np.ones_like(position)
-    target[1::2] = np.nan
-    roll = {"imu/roll": np.zeros(TICKS)}
-    recordings = (
-        make_recording(robot, "a", position=position, target=target),
-        make_recording(robot, "b", support="ground", extras=roll),
-    )
-    loss = ReplayLoss(robot, recordings)
-    replay = make_replay(loss, robot, 0.01)
-    replay.position[0, 6:TICKS] = np.nan
-    measures = accuracy(loss, replay)
-    assert measures.diverged.tolist() == [True, False]
-    assert measures.cells[0, 3] == pytest.approx(0.01)
-    expected = np.sqrt((6 * 0.01**2 + 6 * LOST_POSITION**2) / 12)
-    assert measures.cells[0, 4] == pytest.approx(expected)
-    np.testing.assert_allclose(measures.tilt, [[np.nan, np.nan], [0.01, np.nan]])
-    write_report(tmp_path / "r.html", bounds, robot, recordings, {"NN-PD": replay}, loss)
-    page = Page(tmp_path / "r.html")
-    assert page.table("Recording")[1][1].endswith("(broke down)")
-    assert "torso roll in b" in page.text and "torso pitch" not in page.text
-    assert len(write_overlays(tmp_path / "plots", robot, recordings, replay, loss)) == 2
-
-
-def test_accuracy_weighs_every_recording_the_same(robot: RobotDescription) -> None:
-    long = make_recording(robot, "a", support="ground", extras=tilt(0.0) | {"imu/roll": ROLL})
-    short = make_recording(
-        robot, "b", time=long.time[:3], target=long.target[:3], position=long.position[:3]
-    )
-    loss = ReplayLoss(robot, (long, short))
-    position = loss.position[None].copy()
-    position[:, loss.ticks[1]] += 0.1
-    shape = position.shape[:2]
-    ticks = tick_slices((long, short))
-    replay = Trajectories(ticks, position, np.full((*shape, 2), -3.1), np.zeros((*shape, 2, 3)))
-    measures = accuracy(loss, replay)
-    assert measures.total == pytest.approx(0.1 / np.sqrt(2))
-    np.testing.assert_allclose(measures.per_recording, [0, 0.1], atol=1e-12)
-    np.testing.assert_allclose(measures.per_joint, 0.1 / np.sqrt(2))
-    around = 2 * np.pi - 6.2  # from 3.1 to -3.1 rad
-    np.testing.assert_allclose(measures.tilt, [[around, 3.1], [np.nan, np.nan]])
-
-
-def test_joints_told_to_stay_are_shown_only_as_the_worst(robot: RobotDescription) -> None:
-    recordings = (make_recording(robot, "a"), make_recording(robot, "b"))
-    loss = ReplayLoss(robot, recordings)
-    still = len(robot.joints) - 1
-
-    def shown(off: float) -> list[tuple[str, str]]:
-        replay = make_replay(loss, robot, 0.01)
-        replay.position[..., still] = loss.position[:, still] + off
-        measures = {"x": accuracy(loss, replay)}
-        units = JointUnits.of(robot, recordings)
-        overlays = Overlays(robot, loss, {"x": replay}, measures, units)
-        return [(p.rank, p.signal) for p in overlays.joint_panels([0, 1], "x")]
-
-    names = robot.joint_names
-    calm, wild = shown(0.0), shown(0.5)
-    assert calm[0] == ("worst", names[0]) and calm[-1] == ("best", names[1])
-    assert wild[0] == ("worst", names[still]) and wild[-1] == ("best", names[1])
-
-
-def test_the_only_joint_is_shown_in_several_recordings() -> None:
-    robot = RobotDescription.load("servo_bench")
-    recordings = tuple(make_recording(robot, name, support="bench") for name in "abcd")
-    loss = ReplayLoss(robot, recordings)
-    replay = make_replay(loss, robot, 0.0)
-    for part, off in zip(loss.ticks, (0.03, 0.01, 0.04, 0.02), strict=True):
-        replay.position[:, part] += off
-    measures = {"x": accuracy(loss, replay)}
-    overlays = Overlays(robot, loss, {"x": replay}, measures, JointUnits.of(robot, recordings))
-    panels = overlays.joint_panels(range(4), "x")
-    shown = [(panel.rank, panel.recording.id) for panel in panels]
-    assert shown == [("worst", "c"), ("median", "d"), ("best", "b")]
-
-
-def test_recordings_are_grouped_by_motion_and_step(robot: RobotDescription) -> None:
-    small = make_recording(robot, "a").target / 3
-    recordings = [
-        make_recording(robot, "a"),
-        make_recording(robot, "b", target=small),
-        make_recording(robot, "c", motion="walk", support="ground"),
-        make_recording(robot, "d", target=np.ones_like(small)),
-    ]
-    assert by_motion(recordings, "rad") == {
-        "step, suspended (1 recording)": [3],
-        "step of up to 0.1 rad, suspended (1 recording)": [1],
-        "step of up to 0.3 rad, suspended (1 recording)": [0],
-        "walk, ground (1 recording)": [2],
-    }
-
-
-def test_sliding_joints_are_told_in_millimetres(tmp_path: Path) -> None:
-    robot = RobotDescription.load("emps")
-    recordings = (make_recording(robot, "a", support="bench"),)
-    units = JointUnits.of(robot, recordings)
-    assert units.words(0.0123) == "12.3 mm"
-    space = robot_space(robot, "pd")
-    count = len(space)
-    bounds = Bounds(
-        robot=robot.name,
-        actuator="pd",
-        space=space,
-        nominal=space.nominal,
-        lower=space.lower,
-        upper=space.upper,
-        ci90=np.stack([space.lower, space.upper], axis=1),
-        identified=np.ones(count, dtype=bool),
-        correlation=np.eye(count),
-        weights=np.empty(0),
-        train={"loss": 1.0, "rmse": 0.0123},
-        held_out=None,
-        subsets=(),
-        splits=(),
-        histories={"pd": np.array([3.0])},
-        omitted=(),
-    )
-    loss = ReplayLoss(robot, recordings)
-    position = loss.position[None] + 0.01
-    empty = np.full((1, TICKS, 2), np.nan)
-    replay = Trajectories(loss.ticks, position, empty, np.empty((1, TICKS, 0, 3)))
-    write_report(tmp_path / "r.html", bounds, robot, recordings, {"PD": replay}, loss)
-    page = Page(tmp_path / "r.html")
-    assert "12.3 mm" in page.text and "mrad" not in page.text and "°" not in page.text
-
-
-def test_overlays_are_one_picture_per_recording(
-    tmp_path: Path, robot: RobotDescription, recordings: tuple[Recording, ...]
-) -> None:
-    loss = ReplayLoss(robot, recordings)
-    replay = make_replay(loss, robot, 0.01)
-    paths = write_overlays(tmp_path, robot, recordings, replay, loss)
-    assert [path.name for path in paths] == ["a.png", "b.png", "c.png"]
-    assert all(path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n") for path in paths)
-    assert sorted(tmp_path.iterdir()) == sorted(paths)
-    again = write_overlays(tmp_path / "again", robot, recordings, replay, loss)
-    assert [path.read_bytes() for path in again] == [path.read_bytes() for path in paths]
