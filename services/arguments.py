@@ -74,6 +74,20 @@ def _run(verb: argparse.ArgumentParser) -> None:
     )
     out(verb, "the results of all stages")
     budget(verb, generations=100, subset_generations=30)
+    later = verb.add_argument_group("what follows, for robots with a gait")
+    for name, limits, default, told in (
+        ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 800000"),
+        ("--trials", (0, 1000), None, "walks of a virtual robot, to choose eta by; default: 25"),
+        ("--repeats", (0, 100), 5, "walks of the chosen eta and of the fitted one; default: 5"),
+    ):
+        later.add_argument(
+            name,
+            type=number(*limits),
+            default=default,
+            metavar="N",
+            help=told if name == "--repeats" else f"{told}, 0 leaves it out",
+        )
+    verb.set_defaults(runners=0)
     place(verb)
 
 

@@ -51,26 +51,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> dict[str, Any]:
+    _quiet_torch()
     from pup.recording import load_recordings
     from pup.sysid.accuracy import JointUnits
-    from services.pipeline import default_recordings, run
-    from services.progress import reporter
+    from services.pipeline import Means, Mission, default_recordings, run
+    from services.progress import reporter, trained
 
     robot = RobotDescription.load(options.robot)
     given = options.recordings
     recordings = load_recordings([given], robot) if given else default_recordings(robot)
-    with _folder(options.out) as out, reporter() as progress:
-        stages = run(
-            robot,
-            recordings,
-            _budget(options, robot),
-            out,
-            lambda: places.fits(options),
-            progress,
-            places.cores(options),
-        )
+    budget = _budget(options, robot)
+    mission = Mission(budget, options.train_steps, options.trials, options.repeats)
+    means = Means(
+        lambda: places.fits(options),
+        lambda: places.training(options),
+        reporter,
+        trained,
+        _tell,
+        places.cores(options),
+    )
+    with _folder(options.out) as out:
+        stages = run(robot, recordings, mission, out, means)
     return stages | {
-        "report": str(out / "presysid" / "report.html"),
+        "report": str(out / "report.html"),
         "unit": JointUnits.of(robot, recordings).position,
     }
 
@@ -97,8 +100,7 @@ def _presysid(options: argparse.Namespace) -> dict[str, Any]:
 def _train(options: argparse.Namespace) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("gymnasium") is None:
         raise InputError("training needs PyTorch and RLlib; install pup[learn]")
-    # Torch's threads sleep while they wait: spinning takes the cores from the simulations.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    _quiet_torch()
     from services.progress import trained
     from services.tracking import check
     from services.training import train, training_options
@@ -108,6 +110,11 @@ def _train(options: argparse.Namespace) -> dict[str, Any]:
     with _folder(options.out) as out, trained() as told:
         wanted = training_options(options)
         return train(robot, options.bounds, wanted, out, lambda: places.training(options), told)
+
+
+def _quiet_torch() -> None:
+    """Torch's threads sleep while they wait: spinning takes the cores from the simulations."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def _transfer(options: argparse.Namespace) -> dict[str, Any]:
@@ -305,6 +312,14 @@ def _show_bounds(shown: dict[str, Any]) -> None:
     print(f"report: {shown['report']}")
 
 
+def _show_job(shown: dict[str, Any]) -> None:
+    from services.tables import bounds_table, stages_table
+
+    bounds_table(shown["presysid"], shown["unit"])
+    stages_table(shown)
+    print(f"report: {shown['report']}")
+
+
 def _show_training(shown: dict[str, Any]) -> None:
     from services.tables import training_table
 
@@ -351,7 +366,7 @@ def _show_recordings(shown: dict[str, Any]) -> None:
 
 
 VERBS = {
-    "run": (_run, _show_bounds),
+    "run": (_run, _show_job),
     "import": (_import, _show_recordings),
     "record": (_record, _show_recordings),
     "presysid": (_presysid, _show_bounds),

@@ -32,6 +32,27 @@ def bounds_table(document: dict[str, Any], unit: str) -> None:
     console.print(f"{document['provenance']['seconds']:.0f} s")
 
 
+def stages_table(documents: dict[str, Any]) -> None:
+    """Print what the stages of a job took and found.
+
+    Args:
+      documents: of the stages by name, with `took` and `left_out`.
+    """
+    from services.job_report import TITLES, found
+
+    console = Console(highlight=False)
+    table = Table(title="stages", title_justify="left")
+    table.add_column("stage")
+    table.add_column("s", justify="right")
+    table.add_column("found", overflow="fold")
+    took = documents["took"]
+    for name, words in found({name: documents[name] for name in took}).items():
+        table.add_row(TITLES[name], f"{took[name]:.0f}", words)
+    for name, why in documents["left_out"].items():
+        table.add_row(TITLES[name], "", f"left out: {why}")
+    console.print(table)
+
+
 def replay_table(document: dict[str, Any]) -> None:
     """Print the errors of a `replay.json` document."""
     console = Console(highlight=False)

@@ -24,6 +24,8 @@ TIMEOUT = 30.0
 PATIENCE = 3600.0
 """For a gateway that does not answer, once it has, s."""
 Told = Callable[[str], None]
+Tend = Callable[["Gateway", dict[str, Any]], None]
+"""Sees to a study, given as the gateway tells it, whenever it is looked at."""
 
 
 @dataclass(frozen=True)
@@ -136,13 +138,16 @@ def token_of(given: str | None) -> str:
     return token
 
 
-def transfer(wanted: Wanted, out: Path, told: Told) -> dict[str, Any]:
+def transfer(
+    wanted: Wanted, out: Path, told: Told, tend: Tend = lambda gateway, study: None
+) -> dict[str, Any]:
     """Make or join a study and follow it; write `study.json` as it goes on.
 
     Args:
       wanted: the study.
       out: folder for the file.
       told: hears how far it is.
+      tend: takes an operator's place.
 
     Returns:
       The document of `study.json`.
@@ -169,6 +174,7 @@ def transfer(wanted: Wanted, out: Path, told: Told) -> dict[str, Any]:
     place, last = f"/v1/studies/{study['name']}", ""
     while True:
         study = gateway.get(place)
+        tend(gateway, study)
         if (line := _line(study)) != last:
             told(line)
             last = line

@@ -212,7 +212,9 @@ def test_run_keeps_finished_stages_and_does_again_what_changed(
     first = pup(*command, *TINY, "--json")
     assert first.code == 0, first.err
     assert_plain_progress(first)
-    assert first.json().keys() == {"presysid", "replay", "report", "unit"}
+    told = first.json()
+    assert told.keys() == {"presysid", "replay", "report", "unit", "took", "left_out"}
+    assert told["left_out"].keys() == {"train", "transfer"}
     check(out)
     made = files(out)
     times = {name: (out / name).stat().st_mtime_ns for name in made}

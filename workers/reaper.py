@@ -1,9 +1,10 @@
-"""Ends what an embedded Ray leaves behind when its owner is killed.
+"""Ends what a killed owner leaves behind: an embedded Ray, or the processes of a laboratory.
 
 Ray's own processes follow a killed owner within seconds, some of its agents only after minutes,
-and its folder never. The owner starts this module as a process that holds the other end of a pipe:
-when the pipe closes, whatever way the owner ended, it ends the processes marked with the session's
-name in their environment and removes the folder. On systems without /proc it only does the latter.
+and its folder never; those of a laboratory do not follow at all. The owner starts this module as a
+process that holds the other end of a pipe: when the pipe closes, whatever way the owner ended, it
+ends the processes marked with the session's name in their environment and removes the folder. On
+systems without /proc it only does the latter.
 """
 
 import os
@@ -14,8 +15,8 @@ import sys
 import time
 from pathlib import Path
 
-SESSION = "PUP_RAY_SESSION"
-"""Environment variable that marks the processes of one embedded Ray."""
+SESSION = "PUP_SESSION"
+"""Environment variable that marks the processes of one owner."""
 
 
 def start(folder: str) -> "subprocess.Popen[bytes]":

@@ -3,10 +3,11 @@
 import asyncio
 import logging
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -26,7 +27,7 @@ class Fits:
         self._pool = self._made()
 
     def _made(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_one_thread)
+        return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_begin)
 
     async def run(self, act: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
         """Run a function of a module; once more where the process was killed meanwhile."""
@@ -54,8 +55,9 @@ class Fits:
             child.terminate()
 
 
-def _one_thread() -> None:
-    """Threads of their own for such small matrices only take cores from others."""
+def _begin() -> None:
+    """One thread: more for such small matrices only take cores from others."""
+    threading.Thread(target=_follow, daemon=True).start()
     os.environ["OMP_NUM_THREADS"] = "1"
     import signal
     import warnings
@@ -65,6 +67,14 @@ def _one_thread() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the gateway ends it
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
+
+
+def _follow() -> None:
+    """End with the gateway, also where it was killed."""
+    gateway = parent_process()
+    assert gateway is not None
+    gateway.join()
+    os._exit(0)
 
 
 def _imported() -> None:

@@ -1,0 +1,286 @@
+"""The report of a whole job: one page that needs nothing but itself."""
+
+import base64
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+from pup.files import write_atomic
+from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, as_svg, drawing_style, new_figure
+from pup.sysid.html import Column, Drawing, Html, figure, page, table, tag
+from services.stages import Done
+
+TITLES = {
+    "presysid": "Parameters and bounds",
+    "replay": "Replay of the recordings",
+    "train": "Training",
+    "walk": "Walk in simulation",
+    "transfer": "Walks of the virtual robot",
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a job came to.
+
+    Attributes:
+      robot: name.
+      out: folder of the job.
+      documents: of its stages, by name.
+      done: what the journal tells of them.
+      left_out: stages that were left out, and why.
+    """
+
+    robot: str
+    out: Path
+    documents: Mapping[str, Any]
+    done: Mapping[str, Done]
+    left_out: Mapping[str, str]
+
+
+def write_report(job: Job) -> None:
+    """Write `report.html`, whole or not at all."""
+    with drawing_style():
+        write_atomic(job.out / "report.html", page(f"Job of {job.robot}", *_content(job)))
+
+
+def found(documents: Mapping[str, Any]) -> dict[str, str]:
+    """What each stage found, in a few words.
+
+    Args:
+      documents: of the stages, by name.
+    """
+    words = {
+        "presysid": _bounds_words,
+        "replay": _replay_words,
+        "train": _training_words,
+        "walk": _walk_words,
+        "transfer": _transfer_words,
+    }
+    return {name: words[name](document) for name, document in documents.items()}
+
+
+def _bounds_words(told: Mapping[str, Any]) -> str:
+    known = [p["identified"] for p in told["parameters"]]
+    train = told["loss"]["train"]
+    return (
+        f"{len(known)} parameters, {sum(known)} determined by the recordings; "
+        f"loss {train['loss_before']:.3g} before, {train['loss']:.3g} after"
+    )
+
+
+def _replay_words(told: Mapping[str, Any]) -> str:
+    count = len(told["per_recording"])
+    return f"joint error {told['rmse']:.3g} {told['unit']} over {count} recordings"
+
+
+def _training_words(told: Mapping[str, Any]) -> str:
+    start = told["provenance"]["start"]
+    words = f"{told['steps']:,} steps, {told['direction']}, "
+    if start is None:
+        return words + "from scratch"
+    words += "further from the policy that comes with the robot"
+    return words + (", which was trained on other bounds" if start["other_bounds"] else "")
+
+
+def _walk_words(told: Mapping[str, Any]) -> str:
+    return (
+        f"median {told['distance_median']:.2f} m in {told['time_median']:.1f} s with parameters "
+        f"from the bounds, {told['upright_share']:.0%} without a fall"
+    )
+
+
+def _transfer_words(told: Mapping[str, Any]) -> str:
+    searched = sum(w["purpose"] in ("initial", "search") for w in told["walks"])
+    return (
+        f"{searched} trials; chosen eta {spread(told['chosen'])}, "
+        f"eta of the fitted parameters {spread(told['fitted'])}"
+    )
+
+
+def spread(told: Mapping[str, Any]) -> str:
+    """Mean and standard deviation of distances, in words."""
+    if told["mean"] is None:
+        return "not walked"
+    deviation = "" if told["std"] is None else f" ± {told['std']:.2f}"
+    return f"{told['mean']:.2f}{deviation} m"
+
+
+def _content(job: Job) -> Iterator[Html]:
+    yield tag("h1", f"Job of {job.robot}")
+    yield tag(
+        "p",
+        "Recordings, bounds, a policy within them, and the eta with which a robot of concealed "
+        "physics walks furthest. Distances of the virtual robot are results in simulation too.",
+        class_="lead",
+    )
+    yield tag("dl", *_facts(job), class_="facts")
+    yield from _stages(job)
+    sections = {
+        "presysid": _presysid,
+        "replay": _replay,
+        "train": _train,
+        "walk": _walk,
+        "transfer": _transfer,
+    }
+    for name, document in job.documents.items():
+        told = sections[name](job, document)
+        yield tag("section", tag("h2", TITLES[name]), *told, id=name)
+    yield tag("section", tag("h2", "Artefacts"), *_artefacts(job), id="artefacts")
+
+
+def _facts(job: Job) -> Iterator[Html]:
+    told = job.documents
+    replayed = told["replay"]
+    before, after = (told["presysid"]["loss"]["train"][k] for k in ("rmse_before", "rmse"))
+    unit = replayed["unit"]
+    yield _fact("Joint error", f"{after:.3g} {unit}", f"before the fit: {before:.3g} {unit}")
+    if "walk" in told:
+        median = told["walk"]["distance_median"]
+        yield _fact("Walk in simulation", f"{median:.2f} m", "median over the bounds")
+    if "transfer" in told:
+        yield _fact("Virtual robot, chosen eta", spread(told["transfer"]["chosen"]), "")
+        yield _fact("Virtual robot, eta fitted", spread(told["transfer"]["fitted"]), "no trials")
+
+
+def _fact(name: str, value: str, more: str) -> Html:
+    return tag("div", tag("dt", name), tag("dd", value, *([tag("small", more)] if more else [])))
+
+
+def _stages(job: Job) -> Iterator[Html]:
+    words = found(job.documents)
+    rows = [(TITLES[n], f"{job.done[n].seconds:,.0f}", words[n]) for n in job.documents]
+    rows += [(TITLES[name], "", f"left out: {why}") for name, why in job.left_out.items()]
+    columns = [Column("Stage", "words"), Column("Took [s]", "number"), Column("Found", "long")]
+    yield table("Stages, with the time since each was last interrupted", columns, rows)
+
+
+def _presysid(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+    columns = [Column("Parameter"), Column("Unit", "words")]
+    columns += [Column(t, "number") for t in ("Nominal", "Lower", "Upper")]
+    rows = [
+        (p["name"], p["unit"], *(f"{p[k]:.4g}" for k in ("nominal", "lower", "upper")))
+        for p in told["parameters"]
+    ]
+    vague = ["" if p["identified"] else "unknown" for p in told["parameters"]]
+    yield table("Bounds (grey: not identified by these recordings)", columns, rows, vague)
+    yield tag("p", "More: ", tag("a", "the report of pre-sysID", href="presysid/report.html"), ".")
+
+
+def _replay(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+    columns = [Column("Recording", "long"), Column(f"RMSE [{told['unit']}]", "number")]
+    rows = [(name, f"{error:.3g}") for name, error in told["per_recording"].items()]
+    yield table("Joint error of the fitted model", columns, rows)
+
+
+def _train(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+    yield tag("p", f"{_training_words(told)}.")
+    yield _picture(
+        job.out / "train" / "curve.png",
+        f"Curves of the training over {told['steps']:,} steps.",
+        "While still exploring: distance, time before the fall, reward and divergence over steps.",
+    )
+
+
+def _walk(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+    shown = told["shown"]
+    end = "fell" if shown["fell"] else "stayed up"
+    yield tag("p", f"{_walk_words(told)}.")
+    yield _picture(
+        job.out / "walk" / "gait.png",
+        f"Stick figures of the walk, {shown['distance']:.2f} m in {shown['time']:.1f} s.",
+        f"With the fitted parameters: {shown['distance']:.2f} m in {shown['time']:.1f} s, {end}.",
+    )
+    video = Path(told["video"]).name
+    yield tag("p", "The walk as a ", tag("a", "video", href=f"walk/{video}"), ".")
+
+
+def _transfer(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+    yield tag(
+        "p",
+        f"Walks of at most {told['horizon']:g} s, through gateway, agent and servo bus, of the "
+        f"virtual robot {told['virtual_robot']}. Chosen eta: {_eta(told['eta'])}; "
+        f"eta of the fitted parameters: {_eta(told['fitted_eta'])}.",
+    )
+    yield figure(
+        trials_figure(told),
+        f"Distance of each walk in order and the best so far; {_transfer_words(told)}.",
+        "Dots: trials of the search; line: the best so far; afterwards, in turn, walks of the "
+        "chosen eta and of the fitted parameters' eta.",
+    )
+    rows = [(name, spread(told[key]), _walks(told[key])) for name, key in _COMPARED.items()]
+    columns = [Column("Eta", "words"), Column("Mean ± sd", "number"), Column("Walks [m]", "long")]
+    yield table("After the search", columns, rows)
+    columns = [Column("Walk"), Column("Purpose", "words"), Column("Eta", "words")]
+    columns += [Column("Distance [m]", "number"), Column("Time [s]", "number"), Column("End")]
+    rows = [
+        (
+            str(w["number"]),
+            w["purpose"],
+            _eta(w["eta"]),
+            "" if w["distance"] is None else f"{w['distance']:.3f}",
+            "" if w["time"] is None else f"{w['time']:.1f}",
+            w["reason"] if w["state"] == "succeeded" else f"{w['state']}: {w['reason']}",
+        )
+        for w in told["walks"]
+    ]
+    yield table("All walks", columns, rows)
+
+
+_COMPARED = {"chosen": "chosen", "of the fitted parameters": "fitted"}
+
+
+def _eta(eta: list[float]) -> str:
+    return ", ".join(f"{x:+.2f}" for x in eta)
+
+
+def _walks(told: Mapping[str, Any]) -> str:
+    return ", ".join(f"{d:.2f}" for d in told["distance"])
+
+
+def trials_figure(told: Mapping[str, Any]) -> Drawing:
+    """Distances of the walks in their order, and the best trial so far.
+
+    Args:
+      told: document of `transfer.json`.
+    """
+    walked = [w for w in told["walks"] if w["distance"] is not None]
+    searched = [w for w in walked if w["purpose"] in ("initial", "search")]
+    axes = (drawn := new_figure(4.6, 2.9)).subplots()
+    best = accumulate((w["distance"] for w in searched), max)
+    axes.step(
+        [w["number"] for w in searched], list(best), where="post", color=SOFT, label="best so far"
+    )
+    for label, colour, purposes in (
+        ("trial", INK, ("initial", "search")),
+        ("chosen eta", VERMILLION, ("repeat",)),
+        ("eta of the fitted parameters", BLUE, ("compare",)),
+    ):
+        chosen = [w for w in walked if w["purpose"] in purposes]
+        x, y = [w["number"] for w in chosen], [w["distance"] for w in chosen]
+        axes.plot(x, y, "o", markersize=4, color=colour, label=label)
+    axes.set_xlabel("walk")
+    axes.set_ylabel("distance, m")
+    axes.grid(axis="y")
+    drawn.legend(loc="outside upper left", ncols=2, fontsize=8)
+    return as_svg(drawn)
+
+
+def _picture(file: Path, alt: str, caption: str) -> Html:
+    source = "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode()
+    return tag("figure", tag("img", src=source, alt=alt), tag("figcaption", caption))
+
+
+def _artefacts(job: Job) -> Iterator[Html]:
+    columns = [Column("File", "words"), Column("Stage"), Column("SHA-256", "long")]
+    rows = [
+        (f, name, digest) for name, done in job.done.items() for f, digest in done.files.items()
+    ]
+    yield table("What the job left, and its SHA-256", columns, rows)
+    columns = [Column("Stage"), Column("Input", "words"), Column("SHA-256, or what it is", "long")]
+    rows = [
+        (name, what, is_) for name, done in job.done.items() for what, is_ in done.inputs.items()
+    ]
+    yield table("What each stage depends on", columns, rows)

@@ -1,0 +1,106 @@
+"""Stages of a job, each done once: `run.json` tells from what, and what came of it."""
+
+import hashlib
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+from pup.files import read_json, write_json
+
+JOURNAL = "run.json"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step of a job.
+
+    Attributes:
+      name: of the step.
+      inputs: all that its result depends on by what it is, such as a file; told by its SHA-256 or
+        as it is written.
+      files: what it leaves behind, relative to the job's folder.
+      work: does it; goes on where it was interrupted.
+      folder: that belongs to it alone, and is emptied before it is done with other inputs; empty
+        for a step that sees to that itself.
+      remade: whether it is also emptied where one of its files was changed.
+    """
+
+    name: str
+    inputs: Mapping[str, str]
+    files: tuple[str, ...]
+    work: Callable[[], object]
+    folder: str = ""
+    remade: bool = False
+
+
+@dataclass(frozen=True)
+class Done:
+    """What the journal tells of a step.
+
+    Attributes:
+      inputs: see Stage.
+      seconds: that it took, since it was last interrupted.
+      files: SHA-256 of those of its files that there are.
+    """
+
+    inputs: Mapping[str, str]
+    seconds: float
+    files: Mapping[str, str]
+
+
+class Journal:
+    """The steps of a job that are done.
+
+    Args:
+      out: folder of the job.
+
+    Raises:
+      InputError: there is another file in the journal's place.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out, self.file = out, out / JOURNAL
+        told = read_json(self.file) if self.file.exists() else {"schema": 1, "stages": {}}
+        if not isinstance(told, dict) or not isinstance(told.get("stages"), dict):
+            raise InputError(f"{self.file}: not the journal of a job; use another --out")
+        self._told = {"begun": {}} | told
+
+    def once(self, stage: Stage) -> None:
+        """Do a step, unless it is done from the same inputs and its files are as it left them."""
+        inputs, entry = dict(stage.inputs), self._told["stages"].get(stage.name)
+        same = isinstance(entry, dict) and entry.get("inputs") == inputs
+        if same and entry.get("files") == self._files(stage):
+            return
+        if stage.folder:
+            if self._told["begun"].get(stage.name, inputs) != inputs or (same and stage.remade):
+                shutil.rmtree(self.out / stage.folder, ignore_errors=True)
+            self._told["begun"][stage.name] = inputs
+            write_json(self.file, self._told)
+        begin = time.time()
+        stage.work()
+        seconds = round(time.time() - begin, 1)
+        done = {"inputs": inputs, "seconds": seconds, "files": self._files(stage)}
+        self._told["stages"][stage.name] = done
+        write_json(self.file, self._told)
+
+    def done(self, name: str) -> Done:
+        """What is told of a step that is done."""
+        return Done(**self._told["stages"][name])
+
+    def _files(self, stage: Stage) -> dict[str, str]:
+        there = [name for name in stage.files if (self.out / name).is_file()]
+        return {name: sha256(self.out / name) for name in there}
+
+
+def sha256(file: Path) -> str:
+    """SHA-256 of a file's content."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def content(out: Path, name: str) -> dict[str, Any]:
+    """The JSON document that a step left."""
+    return dict(read_json(out / name))

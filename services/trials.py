@@ -1,0 +1,165 @@
+"""Post-sysID of a job: a virtual robot walks until eta is chosen, unattended (paper, section V)."""
+
+import hashlib
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.files import write_json
+from pup.policy.bundle import CARD, NumpyPolicy
+from pup.robot import RobotDescription
+from pup.sysid.result import FittedBounds, read_bounds
+from pup.transfer.study import StudySettings
+from services.laboratory import AGENT, Laboratory
+from services.transfer import Gateway, Wanted, transfer
+
+SCHEMA = 1
+STUDY = "run"
+ATTEMPTS = 3
+"""To run a trial, before another one takes its place."""
+HOPELESS = 10
+"""Trials without a result, after which the robot is given up."""
+LEASE = 600.0
+"""Silence after which a trial is lost, s: the machine may be busy."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How many walks are made.
+
+    Attributes:
+      trials: until eta is chosen (paper: 25).
+      repeats: of the chosen eta afterwards, and of the fitted one (paper: 5).
+      seed: of the virtual robot's physics and of the search.
+    """
+
+    trials: int = StudySettings.trials
+    repeats: int = StudySettings.repeats
+    seed: int = 0
+
+
+def try_out(
+    robot: RobotDescription,
+    policy: Path,
+    bounds: Path,
+    budget: Budget,
+    out: Path,
+    told: Callable[[str], None],
+) -> dict[str, Any]:
+    """Walk a virtual robot through a study; what was interrupted goes on with the same walks.
+
+    Args:
+      robot: the robot.
+      policy: its bundle.
+      bounds: what pre-sysID found; the eta of its fitted parameters is compared with the chosen.
+      budget: how many walks.
+      out: folder for `transfer.json`, `study.json`, `agent/recordings/`, stores and logs.
+      told: hears how far it is.
+
+    Returns:
+      The document of `transfer.json`.
+
+    Raises:
+      InputError: the policy is not of this robot, or the robot gives no results.
+      ChildProcessError: a process of the laboratory ends again and again.
+    """
+    bundle = NumpyPolicy.load(policy, robot)
+    fitted = fitted_eta(bundle, read_bounds(bounds, robot))
+    settings = {
+        "trials": budget.trials,
+        "initial": min(StudySettings.initial, budget.trials),
+        "repeats": budget.repeats,
+        "compare": [fitted.tolist()],
+        "lease": LEASE,
+        "failures": 1,  # each is looked at by `_attend`
+        "gate": "auto",
+        "agent": AGENT,
+        "seed": budget.seed,
+    }
+    with Laboratory(out, robot, policy, budget.seed) as laboratory:
+
+        def tell(line: str) -> None:
+            laboratory.tend()  # also while the gateway does not answer
+            told(line)
+
+        def tend(gateway: Gateway, study: dict[str, Any]) -> None:
+            laboratory.tend()
+            _attend(gateway, study)
+
+        wanted = Wanted(policy, STUDY, laboratory.url, laboratory.token, settings)
+        study = transfer(wanted, out, tell, tend)
+    document = _document(study, fitted, budget, policy)
+    write_json(out / "transfer.json", document)
+    return document
+
+
+def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]:
+    """The projection of the fitted parameters, shape (n_eta,).
+
+    Raises:
+      InputError: the policy knows parameters that the fitted model does not have.
+    """
+    card, names = policy.card, bounds.space.names
+    if unknown := [name for name in card.parameters if name not in names]:
+        raise InputError(f"the policy is of a model with {unknown[0]!r}, which the fitted has not")
+    mu = bounds.space.nominal[[names.index(name) for name in card.parameters]]
+    lower, upper = np.array(card.parameter_lower), np.array(card.parameter_upper)
+    return policy.project((mu - lower) / np.where(upper > lower, upper - lower, 1.0))
+
+
+def _attend(gateway: Gateway, study: dict[str, Any]) -> None:
+    """What an operator decides on a study that pauses: once more, or without that trial.
+
+    A walk that the end of a process cut off is walked again under the same number, so that the
+    study goes on as if nothing had happened.
+    """
+    if study["state"] != "paused":
+        return
+    place = f"/v1/studies/{study['name']}"
+    trials = gateway.all(f"{place}/trials", "trials")
+    failed = [t for t in trials if t["state"] in ("aborted", "lost")]
+    if len(failed) > HOPELESS:
+        raise InputError(
+            f"the virtual robot gives no results: {failed[-1]['reason']}; try another --seed"
+        )
+    last = trials[-1]
+    if last["attempt"] < ATTEMPTS:
+        number, attempt = last["number"], last["attempt"] + 1
+        gateway.post(f"{place}/trials/{number}:retry", {"attempt": attempt})
+    else:
+        gateway.post(f"{place}:resume", None)
+
+
+def _document(
+    study: dict[str, Any], fitted: NDArray[np.float64], budget: Budget, policy: Path
+) -> dict[str, Any]:
+    kept = ("number", "purpose", "eta", "state", "attempt", "distance", "time", "reason")
+    walks = [{name: t[name] for name in (*kept, "recording", "digest")} for t in study["trials"]]
+    return {
+        "schema": SCHEMA,
+        "robot": study["robot"],
+        "policy_sha256": hashlib.sha256((policy / CARD).read_bytes()).hexdigest(),
+        "virtual_robot": budget.seed,
+        "horizon": study["settings"]["horizon"],
+        "eta": study["eta"],
+        "fitted_eta": fitted.tolist(),
+        "chosen": _walked(walks, "repeat"),
+        "fitted": _walked(walks, "compare"),
+        "walks": walks,
+    }
+
+
+def _walked(walks: list[dict[str, Any]], purpose: str) -> dict[str, Any]:
+    """Distances of the walks made for a purpose, m, with mean and sample standard deviation."""
+    told = [w["distance"] for w in walks if (w["purpose"], w["state"]) == (purpose, "succeeded")]
+    return {
+        "distance": told,
+        "mean": statistics.mean(told) if told else None,
+        "std": statistics.stdev(told) if len(told) > 1 else None,
+    }
