@@ -92,11 +92,11 @@ def _calls(task: WalkingTask, actions: np.ndarray) -> list[Call]:
     simulations = task._simulations
     start, step = simulations.start, simulations.step
 
-    def kept_start(*given: Any) -> None:
+    def kept_start(*given: Any) -> Any:
         calls.append(
             ("start", tuple(np.copy(a) if isinstance(a, np.ndarray) else a for a in given))
         )
-        start(*given)
+        return start(*given)
 
     def kept_step(*given: Any) -> Any:
         calls.append(("step", tuple(np.copy(a) for a in given)))

@@ -25,7 +25,7 @@ from pup.locomotion.reference import Reference
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.physics.actuators import NetworkPD
-from pup.robot import RobotDescription, TermSpec
+from pup.robot import RobotDescription
 
 NOISY = TaskSettings()
 SILENT = replace(
@@ -298,10 +298,6 @@ def test_directions_turn_the_reward_and_leave_the_physics() -> None:
     [
         (RobotDescription.load("so101"), "has no [gait]"),
         (replace(DARWIN, floating=False), "cannot walk: it needs a free joint"),
-        (
-            replace(DARWIN, terms=(TermSpec("backlash", "group", "knee", {"gap": 0.01}),)),
-            "walking is trained without terms; backlash would be left out",
-        ),
     ],
 )
 def test_a_robot_that_cannot_walk_is_refused(robot: RobotDescription, message: str) -> None:

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.actuators import LAWS
-from pup.physics.fields import apply_fields
 from pup.physics.limited import LimitedLaw
-from pup.physics.model import FLOOR, compile_model, joint_inertia
+from pup.physics.live import LiveServos, has_terms, paced
+from pup.physics.model import FLOOR, Model, compile_model, joint_inertia, standing_qpos
+from pup.physics.outfit import Outfit, fit_out
 from pup.physics.parameters import Candidates
 from pup.physics.writer import RowWriter
 from pup.robot import RobotDescription
@@ -23,6 +24,7 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 T = TypeVar("T")
+P = TypeVar("P", bound="Pose")
 
 FASTEST = 1e3
 """No joint or torso moves faster, m/s or rad/s: a simulation beyond it has broken down."""
@@ -36,14 +38,28 @@ _COUNT = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
 
 
 @dataclass(frozen=True)
-class Motion:
+class Pose:
+    """Where robots stand and what they read of it, a row per simulation.
+
+    Attributes:
+      root: the torso's place and orientation, shape (n, 7): m, and a quaternion (w, x, y, z).
+      encoders: positions of the joints as they are read, shape (n, n_joints), rad.
+      imu: orientation of the torso as it is read, less what the IMU's site adds, shape (n, 4).
+    """
+
+    root: Array
+    encoders: Array
+    imu: Array
+
+
+@dataclass(frozen=True)
+class Motion(Pose):
     """What a control step left, a row per simulation.
 
     Attributes:
       position: of the joints, shape (n, n_joints), rad.
       velocity: of the joints, rad/s.
       torque: of the servos over the last sub-step, N m.
-      root: the torso's place and orientation, shape (n, 7): m, and a quaternion (w, x, y, z).
       drift: velocity of the centre of mass, shape (n, 3), m/s; it and `touching` are of the state
         before the last sub-step.
       touching: whether anything touches but allowed bodies the floor, shape (n,).
@@ -53,7 +69,6 @@ class Motion:
     position: Array
     velocity: Array
     torque: Array
-    root: Array
     drift: Array
     touching: NDArray[np.bool_]
     lost: NDArray[np.bool_]
@@ -61,6 +76,9 @@ class Motion:
 
 class Simulations:
     """n walking robots, each with parameters and a time step of its own.
+
+    Terms among the parameters act as in a replay; a clock that commands come by acts on the
+    time step.
 
     Each thread steps a batch of its own, so that the torques are computed on all cores too.
 
@@ -70,6 +88,7 @@ class Simulations:
       actuator: `nn_pd` or `pd`.
       n: simulations.
       substeps: per control step.
+      period: shortest of a control step, s.
       threads: batches; None for as many as there are cores.
     """
 
@@ -80,38 +99,42 @@ class Simulations:
         actuator: str,
         n: int,
         substeps: int,
+        period: float,
         threads: int | None = None,
     ) -> None:
         threads = min(n, threads or len(os.sched_getaffinity(0)))
         edges = np.linspace(0, n, threads + 1).astype(np.int64)
         self._edges = edges
         self._parts = [
-            _Part(robot, nominal, actuator, int(b - a), substeps) for a, b in pairwise(edges)
+            _Part(robot, nominal, actuator, int(b - a), substeps, period)
+            for a, b in pairwise(edges)
         ]
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def start(
         self, rows: Rows, candidates: Candidates, timestep: Array, qpos: Array, qvel: Array
-    ) -> None:
+    ) -> Pose:
         """Put some simulations into a state.
 
         Args:
           rows: which, ascending, shape (k,).
           candidates: their parameters, k rows.
           timestep: their sub-steps, shape (k,), s.
-          qpos: their states, shape (k, nq).
+          qpos: their states by their encoders, shape (k, nq).
           qvel: shape (k, nv).
+
+        Returns:
+          How they stand, k rows.
         """
         at = np.searchsorted(rows, self._edges)
 
-        def start(index: int) -> None:
+        def start(index: int) -> Pose:
             own = slice(at[index], at[index + 1])
-            if own.start < own.stop:
-                local = rows[own] - self._edges[index]
-                values = Candidates(candidates.space, candidates.values[own])
-                self._parts[index].start(local, values, timestep[own], qpos[own], qvel[own])
+            local = rows[own] - self._edges[index]
+            values = Candidates(candidates.space, candidates.values[own])
+            return self._parts[index].start(local, values, timestep[own], qpos[own], qvel[own])
 
-        self._each(start)
+        return _joined(self._each(start))
 
     def step(self, target: Array, running: NDArray[np.bool_]) -> Motion:
         """One control step of the running simulations.
@@ -125,14 +148,7 @@ class Simulations:
             own = slice(self._edges[index], self._edges[index + 1])
             return self._parts[index].advance(target[own], running[own])
 
-        motions = self._each(advance)
-        if len(motions) == 1:
-            return motions[0]
-        joined = {
-            field.name: np.concatenate([getattr(motion, field.name) for motion in motions])
-            for field in fields(Motion)
-        }
-        return Motion(**joined)
+        return _joined(self._each(advance))
 
     def _each(self, act: Callable[[int], T]) -> list[T]:
         if self._pool is None:
@@ -150,6 +166,16 @@ class Simulations:
             part.restore({name: values[a:b] for name, values in state.items()})
 
 
+def _joined(parts: list[P]) -> P:
+    """Rows of all parts."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [field.name for field in fields(parts[0])]
+    return type(parts[0])(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
+
+
 class _Part:
     """One batch."""
 
@@ -160,74 +186,125 @@ class _Part:
         actuator: str,
         n: int,
         substeps: int,
+        period: float,
     ) -> None:
         self.robot = robot
         self.substeps = substeps
         self.model = compile_model(robot, "ground", _sense)
         self.batch = mujoco.batch.Batch(self.model.compiled, n, 1)
         self.make = LAWS[actuator]
-        values = np.repeat(nominal.values, n, axis=0)
-        law = self.make(robot, nominal.space.candidates(values))
-        shape = n, len(robot.joints)
-        inertia = joint_inertia(self.model, law.armature, shape).copy()
-        timestep = np.full((n, 1), robot.timestep)
-        self.limited = LimitedLaw(law, inertia, np.zeros(shape), timestep)
+        candidates = nominal.space.candidates(np.repeat(nominal.values, n, axis=0))
+        law = self.make(robot, candidates)
+        self.live: LiveServos | None = None
+        if has_terms(nominal.space):
+            self.live = LiveServos(robot, self.model, law, candidates, period, substeps)
+            self.limited = self.live.servos.limited
+        else:
+            inertia = joint_inertia(self.model, law.armature, (n, len(robot.joints)))
+            self.limited = LimitedLaw(law, inertia, np.zeros_like(inertia), period / substeps)
         self.setups = (robot.setup({}),)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.force, self.damping = self.batch.bind("qfrc_applied"), self.batch.expand("dof_damping")
         self.sensed, self.contacts = self.batch.bind("sensordata"), self.batch.bind("ncon")
+        self.wrenches = self.bias = None
+        if self.live is not None:
+            if any(term.answers("push") for term in self.live.terms):
+                self.wrenches = self.batch.bind("xfrc_applied")
+            if self.live.servos.loaded:
+                self.bias = self.batch.bind("qfrc_bias")
 
     def start(
         self, rows: Rows, candidates: Candidates, timestep: Array, qpos: Array, qvel: Array
-    ) -> None:
+    ) -> Pose:
         """See Simulations.start."""
-        limited, ids = self.limited, rows.astype(np.int32)
-        fresh = self.make(self.robot, candidates)
-        limited.law.renew(rows, fresh)
-        shape = len(rows), len(self.robot.joints)
-        limited.inertia[rows] = joint_inertia(self.model, fresh.armature, shape)
+        if not len(rows):
+            return self._pose(rows)
+        ids, model = rows.astype(np.int32), self.model
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        writer = RowWriter(self.batch, self.model.compiled, ids)
-        limited.viscous[rows] = fresh.passive + apply_fields(
-            writer, self.robot, self.model, candidates, self.setups, fresh.armature
+        writer = RowWriter(self.batch, model.compiled, ids)
+        law = self.make(self.robot, candidates)
+        outfit = fit_out(
+            self.robot, model, law, candidates, self.setups, writer, timestep[:, None].copy(), True
         )
-        limited.timestep[rows] = timestep[:, None]
-        writer.field("opt.timestep")[:] = timestep
+        paced(outfit)
+        writer.field("opt.timestep")[:] = np.asarray(outfit.scene.timestep)[:, 0]
         writer.done()
+        qpos = _as_it_stands(self.robot, model, outfit, qpos)
         self.qpos[rows], self.qvel[rows] = qpos, qvel
-        limited.derive()
-        limited.forget(rows, qvel[:, self.model.dofs])
+        if self.live is None:
+            scene = outfit.scene
+            self.limited.renew(rows, law, scene.inertia, outfit.viscous, scene.timestep)
+            self.limited.forget(rows, qvel[:, model.dofs])
+        else:
+            link = qpos[:, model.qpos], qvel[:, model.dofs]
+            self._push(ids, outfit)
+            if self.bias is not None:
+                self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+            self.live.start(rows, outfit, candidates, link, qpos[:, 3:7], self._bias(rows))
+        return self._pose(rows)
+
+    def _push(self, ids: NDArray[np.int32], outfit: Outfit) -> None:
+        """Apply the terms' wrenches."""
+        if self.wrenches is not None:
+            wrenches = np.zeros_like(self.wrenches[ids])
+            for term in outfit.terms:
+                if term.answers("push"):
+                    term.push(wrenches)
+            self.wrenches[ids] = wrenches
+
+    def _bias(self, rows: Rows | slice) -> Array | None:
+        """Torques of gravity and motion where a sub-step began, for terms that ask; N m."""
+        return None if self.bias is None else self.bias[rows][:, self.model.dofs]
+
+    def _pose(self, rows: Rows) -> Pose:
+        root = self.qpos[rows, :7]
+        if self.live is None:
+            return Pose(root, self.qpos[rows][:, self.model.qpos], root[:, 3:])
+        return Pose(root, self.live.encoders(rows), self.live.imu(root[:, 3:], rows))
+
+    def _answer(self, target: Array) -> tuple[Array, Array]:
+        """Torques and viscous coefficients of one sub-step."""
+        link = self.qpos[:, self.model.qpos], self.qvel[:, self.model.dofs]
+        if self.live is None:
+            return self.limited.torque(target - link[0], link[1])
+        return self.live.torque(link)
 
     def advance(self, target: Array, running: NDArray[np.bool_]) -> Motion:
         """See Simulations.step."""
-        position = self.qpos[:, self.model.qpos]
-        velocity = self.qvel[:, self.model.dofs]
+        dofs, live = self.model.dofs, self.live
         ids = None if running.all() else np.flatnonzero(running).astype(np.int32)
         told = self.batch.warning[:, _WARNINGS, 1].sum(axis=1)
         broken = np.zeros(len(target), dtype=bool)
         if ids is None or len(ids):
             with np.errstate(invalid="ignore", over="ignore"):  # of those that break down
+                if live is not None:
+                    live.tell(target)
                 for _ in range(self.substeps):
-                    position = self.qpos[:, self.model.qpos]
-                    velocity = self.qvel[:, self.model.dofs]
-                    answer = self.limited.torque(target - position, velocity)
-                    self.force[:, self.model.dofs], self.damping[:, self.model.dofs] = answer
+                    self.force[:, dofs], self.damping[:, dofs] = self._answer(target)
                     try:
                         self.batch.step(ids=ids)
                     except mujoco.batch.SimulationError as error:
                         broken[error.ids] = True
                         self.batch.reset(ids=error.ids)
+                    if live is not None:
+                        link = self.qpos[:, self.model.qpos], self.qvel[:, dofs]
+                        live.moved(link, self.qpos[:, 3:7], self._bias(slice(None)))
         told = self.batch.warning[:, _WARNINGS, 1].sum(axis=1) - told
         lost = broken | (told > 0) | ~(np.abs(self.qvel).max(axis=1) < FASTEST)
         if lost.any():
             self.batch.reset(ids=np.flatnonzero(lost).astype(np.int32))
-        velocity = self.qvel[:, self.model.dofs].copy()
+        position, velocity = self.qpos[:, self.model.qpos].copy(), self.qvel[:, dofs].copy()
+        pose = Pose(root := self.qpos[:, :7].copy(), position, root[:, 3:])
+        if live is not None:
+            pose = self._pose(np.arange(len(target)))
         allowed = self.sensed[:, 3:].sum(axis=1)
         return Motion(
-            position=self.qpos[:, self.model.qpos].copy(),
+            root=pose.root,
+            encoders=pose.encoders,
+            imu=pose.imu,
+            position=position,
             velocity=velocity,
-            torque=self.limited.acted(velocity),
-            root=self.qpos[:, :7].copy(),
+            torque=self.limited.acted(velocity if live is None else live.velocity),
             drift=self.sensed[:, :3].copy(),
             touching=self.contacts > allowed,
             lost=lost,
@@ -235,12 +312,30 @@ class _Part:
 
     def state(self) -> dict[str, Array]:
         """See Simulations.state."""
-        return {"physics": self.batch.state.copy(), **self.limited.state()}
+        state = {"physics": self.batch.state.copy(), **self.limited.state()}
+        if self.live is not None:
+            state |= self.live.state()
+        return state
 
     def restore(self, state: dict[str, Array]) -> None:
         """See Simulations.restore."""
         self.batch.state[:] = state["physics"]
         self.limited.restore(state)
+        if self.live is not None:
+            self.live.restore(state)
+
+
+def _as_it_stands(robot: RobotDescription, model: Model, outfit: Outfit, qpos: Array) -> Array:
+    """States (k, nq) where encoders read the given ones; the torso is set on the floor again."""
+    position, unread = qpos[:, model.qpos].copy(), np.full((len(qpos), 4), np.nan)
+    for term in reversed(outfit.terms):
+        term.start(position, unread)
+    off = np.flatnonzero((position != qpos[:, model.qpos]).any(axis=1))
+    if len(off):
+        qpos = qpos.copy()
+        for row in off:
+            qpos[row] = standing_qpos(robot, model, position[row], qpos[row, 3:7])
+    return qpos
 
 
 def _sense(robot: RobotDescription, spec: mujoco.MjSpec) -> None:

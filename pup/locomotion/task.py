@@ -15,8 +15,9 @@ from pup.errors import InputError
 from pup.locomotion.reference import Reference
 from pup.locomotion.sampling import MARGIN, ParameterSampler
 from pup.locomotion.settings import TaskSettings
-from pup.locomotion.simulations import Motion, Simulations
+from pup.locomotion.simulations import Motion, Pose, Simulations
 from pup.locomotion.start import Starts
+from pup.physics.outfit import mount
 from pup.physics.rotations import multiply, roll_pitch
 from pup.robot import Gait, RobotDescription
 
@@ -115,7 +116,7 @@ class WalkingTask:
       threads: None for as many as there are cores.
 
     Raises:
-      InputError: the robot cannot walk, or has terms, which the task does not simulate.
+      InputError: the robot cannot walk, or a term of it cannot act.
     """
 
     def __init__(
@@ -144,9 +145,15 @@ class WalkingTask:
         self._starts = Starts(robot, self.reference.start, settings, n)
         bounds = sampler.bounds
         self._simulations = Simulations(
-            robot, bounds.space.candidates(), bounds.actuator, n, settings.substeps, threads
+            robot,
+            bounds.space.candidates(),
+            bounds.actuator,
+            n,
+            settings.substeps,
+            1 / settings.control_rate[1],
+            threads,
         )
-        self._mount = _mount(robot, self._starts)
+        self._mount = mount(robot, self._starts.model)
         self._episodes = self._blank()
 
     @property
@@ -243,17 +250,16 @@ class WalkingTask:
         episodes.steps[rows], episodes.time[rows], episodes.actions[rows] = 0, 0.0, 0.0
         episodes.over[rows] = False
         qpos, qvel = self._starts.draw(rng, k)
-        self._put(rows, qpos, qvel)
-        episodes.start[rows] = episodes.place[rows] = qpos[:, :3]
-        position = qpos[:, self._starts.model.qpos]
-        episodes.position[rows] = self._noisy(position, rng)[:, None]
-        episodes.tilt[rows] = self._tilted(qpos[:, 3:7], episodes.bias[rows], rng)[:, None]
+        pose = self._put(rows, qpos, qvel)
+        episodes.start[rows] = episodes.place[rows] = pose.root[:, :3]
+        episodes.position[rows] = self._noisy(pose.encoders, rng)[:, None]
+        episodes.tilt[rows] = self._tilted(pose.imu, episodes.bias[rows], rng)[:, None]
 
-    def _put(self, rows: Rows, qpos: Array, qvel: Array) -> None:
+    def _put(self, rows: Rows, qpos: Array, qvel: Array) -> Pose:
         """Give simulations the parameters of their episodes, and a state."""
         timestep = self._episodes.period[rows] / self.settings.substeps
         parameters = self.sampler.candidates(self._episodes.mu[rows])
-        self._simulations.start(rows, parameters, timestep, qpos, qvel)
+        return self._simulations.start(rows, parameters, timestep, qpos, qvel)
 
     def _target(self, reference: Array, action: NDArray[np.integer]) -> Array:
         """Reference + reach times the mean of the latest actions, within the joint limits."""
@@ -293,8 +299,8 @@ class WalkingTask:
     def _read(self, motion: Motion) -> None:
         """Take new readings; a simulation that broke down keeps its last."""
         episodes, lost = self._episodes, motion.lost[:, None]
-        position = self._noisy(motion.position, self.rng)
-        tilt = self._tilted(motion.root[:, 3:], episodes.bias, self.rng)
+        position = self._noisy(motion.encoders, self.rng)
+        tilt = self._tilted(motion.imu, episodes.bias, self.rng)
         for kept, new in ((episodes.position, position), (episodes.tilt, tilt)):
             kept[:, 0] = kept[:, 1]
             kept[:, 1] = np.where(lost, kept[:, 1], new)
@@ -304,7 +310,7 @@ class WalkingTask:
         return np.asarray(position + noise)
 
     def _tilted(self, torso: Array, bias: Array, rng: np.random.Generator) -> Array:
-        """The IMU's roll and pitch, shape (n, 2), rad, for orientations of the torso."""
+        """The IMU's roll and pitch, shape (n, 2), rad, for orientations of the torso as read."""
         tilt = roll_pitch(multiply(torso, self._mount)) + bias
         tilt[:, 1] -= self.gait.imu_pitch_offset
         noise = self.settings.tilt_noise
@@ -340,16 +346,4 @@ def _gait(robot: RobotDescription) -> Gait:
         raise InputError(
             f"{file}: robot {robot.name!r} cannot walk: it needs a free joint in model.xml and feet"
         )
-    if robot.terms:
-        raise InputError(
-            f"{file}: term[1]: walking is trained without terms; "
-            f"{robot.terms[0].effect} would be left out"
-        )
     return robot.gait
-
-
-def _mount(robot: RobotDescription, starts: Starts) -> Array:
-    """The IMU's orientation in the torso, a quaternion."""
-    if robot.imu_site is None:
-        return np.array([1.0, 0, 0, 0])
-    return np.array(starts.model.compiled.site(robot.imu_site).quat)

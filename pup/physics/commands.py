@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.simulator import Schedule
+from pup.physics.terms.base import begin
 
 Array = NDArray[np.float64]
 
@@ -32,7 +33,30 @@ class Target:
     share: Array
 
 
-class Commands:
+class _Held:
+    """Commands, each held until the next, that may come late."""
+
+    timestep: float | Array
+
+    def late(self, step: int | Array, lateness: Array) -> Target:
+        """Targets that arrive late.
+
+        Args:
+          step: the sub-step; where simulations have one each, shape (n_simulations, 1, 1).
+          lateness: shape (n_recordings, n_candidates, n_joints or 1), s; negative for early.
+        """
+        end = (step + 0.5) * self.timestep - lateness
+        now, told = self._held_at(end)
+        before, _ = self._held_at((step - 0.5) * self.timestep - lateness)
+        since = (end - told) / self.timestep
+        return Target(now, before, np.where(now == before, 1.0, np.clip(since, 0, 1)))
+
+    def _held_at(self, time: Array) -> tuple[Array, Array]:
+        """What is held at some times, and since when."""
+        raise NotImplementedError
+
+
+class Commands(_Held):
     """The commands of some recordings, each held until its next.
 
     Args:
@@ -77,28 +101,68 @@ class Commands:
         share = np.where(now == before, 1.0, self._share[step, :running, None, None])
         return Target(now, before, share)
 
-    def late(self, step: int, lateness: Array) -> Target:
-        """Targets that arrive late.
-
-        Args:
-          step: the sub-step.
-          lateness: shape (n_recordings, n_candidates, n_joints or 1), s; negative for early.
-        """
-        end = (step + 0.5) * self.timestep - lateness
-        recordings = np.arange(len(lateness))[:, None, None]
-        now, row = self._held_at(end, recordings)
-        before, _ = self._held_at((step - 0.5) * self.timestep - lateness, recordings)
-        since = (end - self.time[recordings, row]) / self.timestep
-        return Target(now, before, np.where(now == before, 1.0, np.clip(since, 0, 1)))
-
-    def _held_at(
-        self, time: Array, recordings: NDArray[np.int64]
-    ) -> tuple[Array, NDArray[np.int64]]:
+    def _held_at(self, time: Array) -> tuple[Array, Array]:
+        recordings = np.arange(len(time))[:, None, None]
         cell = np.clip((time / self.timestep).astype(np.int64), 0, self.steps)
         row = self._last[recordings, cell]
         row = row + (self.time[recordings, row + 1] <= time)
         joints = np.arange(self.held.shape[2])
-        return self.held[recordings, row, joints], row
+        return self.held[recordings, row, joints], self.time[recordings, row]
+
+
+class LiveCommands(_Held):
+    """Commands that are told as simulations go, one for all joints of each at a time.
+
+    A command holds from the beginning of the sub-step before which it was told, which is half a
+    sub-step before its position (see `simulator`). The first one counts as told long before.
+
+    Args:
+      shape: (n_simulations, n_joints).
+      depth: commands that are kept for those whom they reach late, the newest among them.
+    """
+
+    def __init__(self, shape: tuple[int, int], depth: int) -> None:
+        n, joints = shape
+        self.timestep: Array = np.ones((n, 1, 1))
+        self.held = np.full((n, depth, joints), np.nan)
+        self.told = np.full((n, depth), -np.inf)
+
+    def renew(self, rows: NDArray[np.int64], timestep: Array) -> None:
+        """Forget what some simulations were told.
+
+        Args:
+          rows: which.
+          timestep: their sub-steps from now on, shape (n_rows, 1), s.
+        """
+        self.timestep[rows] = timestep[:, None]
+        self.held[rows], self.told[rows] = np.nan, -np.inf
+
+    def tell(self, target: Array, step: Array) -> None:
+        """Tell all simulations a target.
+
+        Args:
+          target: shape (n_simulations, n_joints), rad.
+          step: sub-steps that each has done, shape (n_simulations, 1).
+        """
+        self.held[:, 1:], self.told[:, 1:] = self.held[:, :-1].copy(), self.told[:, :-1].copy()
+        self.held[:, 0], self.told[:, 0] = target, ((step - 0.5) * self.timestep[:, 0])[:, 0]
+        begin(self.held, target[:, None])
+
+    def on_time(self, step: Array, running: int) -> Target:
+        """The newest targets."""
+        return Target(self.held[:, 0], None, _ONE)
+
+    def late(self, step: int | Array, lateness: Array) -> Target:
+        """See _Held; a command never comes before it is told."""
+        return super().late(np.asarray(step)[:, :, None], np.maximum(lateness, 0.0))
+
+    def _held_at(self, time: Array) -> tuple[Array, Array]:
+        held, told = self.held[:, 0, None], self.told[:, 0, None, None]
+        for age in range(1, self.held.shape[1]):
+            early = time < self.told[:, age - 1, None, None]
+            held = np.where(early, self.held[:, age, None], held)
+            told = np.where(early, self.told[:, age, None, None], told)
+        return held, told
 
 
 def _changes(plan: Schedule) -> tuple[Array, Array]:

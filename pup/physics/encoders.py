@@ -43,6 +43,19 @@ class History:
         self.values = np.zeros((depth, simulations, width))
         self.count = 0
 
+    def begin(self, rows: NDArray[np.int64], values: Array, age: Array) -> None:
+        """Let some simulations, which start one by one, have stood still until now.
+
+        Args:
+          rows: which.
+          values: theirs, shape (n_rows, width).
+          age: how old their readings are from now on, sub-steps; at most as old as any first was.
+        """
+        assert self.age is not None
+        self.age[rows] = np.minimum(age, len(self.values) - 2)
+        self.values[:, rows] = values
+        self.count = max(self.count, len(self.values))
+
     def push(self, values: Array) -> None:
         """Take the values of the first simulations at one more sub-step."""
         self.values[self.count % len(self.values), : len(values)] = values
@@ -60,3 +73,12 @@ class History:
         depth, column = len(self.values), np.arange(self.values.shape[2])
         before, after = (self.values[(whole + i) % depth, rows[:, None], column] for i in (0, 1))
         return np.asarray(before + share * (after - before))
+
+    def state(self) -> Array:
+        """What is kept, the newest last, shape (n_simulations, n_kept, width)."""
+        newest_last = np.roll(self.values, -(self.count % len(self.values)), axis=0)
+        return np.ascontiguousarray(newest_last.swapaxes(0, 1))
+
+    def restore(self, state: Array) -> None:
+        """Take up a state of simulations that were all started by `begin`."""
+        self.values[:], self.count = state.swapaxes(0, 1), len(self.values)

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from pup.physics.actuators import TorqueLaw
 from pup.physics.implicit import implicit_share
+from pup.physics.terms.base import begin
 
 Array = NDArray[np.float64]
 
@@ -78,18 +79,36 @@ class LimitedLaw:
         """Note what a sub-step applies, for the next one."""
         self._last = velocity.copy(), torque, damping
 
-    def forget(self, rows: NDArray[np.int64], velocity: Array) -> None:
-        """Let some simulations start from a velocity, as if nothing had acted before.
+    def begin(self) -> None:
+        """Let all simulations start: nothing is known of what has acted before."""
+        self._last = None
+
+    def renew(
+        self,
+        rows: NDArray[np.int64],
+        law: TorqueLaw,
+        inertia: Array,
+        viscous: Array,
+        timestep: float | Array,
+    ) -> None:
+        """Give some simulations what another law was made of, one row for each."""
+        self.law.renew(rows, law)
+        self.inertia[rows], self.viscous[rows], self.timestep[rows] = inertia, viscous, timestep
+        self.derive()
+
+    def forget(self, rows: NDArray[np.int64], velocity: Array, torque: float = 0.0) -> None:
+        """Let some simulations start from a velocity.
 
         Args:
           rows: which.
           velocity: of their joints, shape (n_rows, n_joints), rad/s.
+          torque: that has acted before, N m; NaN as in a replay, where nothing is known of it.
         """
         if self._last is None:
             still = np.zeros_like(self.inertia)
             self._last = still, still.copy(), still.copy()
-        before, torque, damping = self._last
-        before[rows], torque[rows], damping[rows] = velocity, 0.0, 0.0
+        before, acted, damping = self._last
+        before[rows], acted[rows], damping[rows] = velocity, torque, 0.0
 
     def state(self) -> dict[str, Array]:
         """What the next sub-step depends on: velocity, torque and damping of the last one."""
@@ -141,6 +160,7 @@ class LimitedLaw:
         slower = reach * damping
         slower += 1
         ahead /= slower
+        begin(ahead, velocity)
         return ahead
 
     def implicit(self, damping: Array) -> Array | None:

@@ -14,14 +14,15 @@ from pup.errors import InputError
 from pup.physics.actuators import LAWS, TorqueLaw
 from pup.physics.commands import Commands
 from pup.physics.encoders import Event, History
-from pup.physics.fields import apply_fields, scaled
-from pup.physics.model import Model, compile_model, first_tilt, joint_inertia, standing_qpos
+from pup.physics.fields import scaled
+from pup.physics.model import Model, compile_model, first_tilt, standing_qpos
+from pup.physics.outfit import as_the_imu_tells, fit_out, longest, mount
 from pup.physics.parameters import Candidates
 from pup.physics.push import Push, Pushing
 from pup.physics.rotations import multiply, roll_pitch
 from pup.physics.servo import Servos
 from pup.physics.simulator import Schedule, Trajectories, schedule, tick_slices
-from pup.physics.terms import Drivetrain, Scene, Term, bind_terms
+from pup.physics.terms import Drivetrain
 from pup.physics.writer import FieldWriter
 from pup.recording import Recording
 from pup.robot import RobotDescription
@@ -211,31 +212,28 @@ class _Run:
         nsim = len(group.setups) * self.candidates
         each = scaled(robot, candidates, group.setups)
         self.batch = mujoco.batch.Batch(group.model.compiled, nsim, 1)
-        bound = law(robot, each)
         writer = FieldWriter(self.batch, group.model.compiled)
-        viscous = bound.passive + apply_fields(
-            writer, robot, group.model, each, group.setups, bound.armature
-        )
-        scene = _scene(robot, group.model, bound, viscous.shape)
-        self.terms = bind_terms(each, scene)
-        for term in self.terms:
-            term.fields(writer)
+        bound = law(robot, each)
+        outfit = fit_out(robot, group.model, bound, each, group.setups, writer, robot.timestep)
         writer.done()
+        self.terms = outfit.terms
         delay = each["command_delay"] if "command_delay" in candidates else None
-        self.servos = Servos(
-            bound, group.commands, group.power, self.terms, scene, viscous, delay, self.candidates
-        )
+        self.servos = Servos(outfit, group.commands, group.power, delay, self.candidates)
         self.push = None if push is None else Pushing(push, group.model, robot.timestep)
         self.ids = np.arange(nsim, dtype=np.int32)
         self.broken = np.zeros(nsim, dtype=bool)
         self._start(nsim)
-        age = _longest(self.terms, "delay", robot.timestep)
-        self.joints = History(nsim, len(robot.joints), age)
+        self.joints = History(nsim, len(robot.joints), self._age("delay"))
         self.feet = [group.model.compiled.body(foot).id for foot in robot.feet]
         if group.model.floating:
             self.places = self.batch.bind("xpos")
-            self.mount = _mount(robot, group.model)
-            self.torso = History(nsim, 4, _longest(self.terms, "tilt_delay", robot.timestep))
+            self.mount = mount(robot, group.model)
+            self.torso = History(nsim, 4, self._age("tilt_delay"))
+
+    def _age(self, hook: str) -> Array | None:
+        """How old readings are, sub-steps."""
+        ages = longest(self.terms, hook)
+        return None if ages is None else ages / self.robot.timestep
 
     def _start(self, nsim: int) -> None:
         """Put the simulations where the recordings start."""
@@ -255,6 +253,7 @@ class _Run:
         model = self.group.model
         sensed = self.servos.sense(self.qpos[:, model.qpos], self.qvel[:, model.dofs])
         self._drive(0, nsim, sensed)
+        self.servos.begin()
         self.batch.forward()
         behind = self.batch.model.opt.timestep / 2 * acceleration
         for term in self.terms:
@@ -287,6 +286,7 @@ class _Run:
         model, rows = self.group.model, train.rows
         position, velocity = self.qpos.copy(), self.qvel.copy()
         self._drive(0, len(self.ids), sensed, still=True)
+        self.servos.begin()
         self._advance(rows)
         train.tried(self.qpos[:, model.qpos], self.qvel[:, model.dofs], velocity[:, model.dofs])
         gained = np.asarray((self.qvel - velocity)[rows] / 2)
@@ -358,11 +358,7 @@ class _Run:
         rows, fraction = self._rows(event)
         _write(out.position, part, event, self._sound(rows, self.joints.read(rows, fraction)))
         if self.group.model.floating:
-            torso = self.torso.read(rows, fraction)
-            torso /= np.linalg.norm(torso, axis=1, keepdims=True)
-            for term in self.terms:
-                if term.answers("tilt"):
-                    torso = term.tilt(torso, rows)
+            torso = as_the_imu_tells(self.terms, self.torso.read(rows, fraction), rows)
             tilt = roll_pitch(multiply(torso, self.mount))
             _write(out.tilt, part, event, self._sound(rows, tilt))
 
@@ -385,24 +381,3 @@ class _Run:
 def _write(to: Array, part: slice, event: Event, values: Array) -> None:
     shaped = values.reshape(len(event.rows), -1, *values.shape[1:])
     to[part, event.ticks] = shaped.swapaxes(0, 1)
-
-
-def _scene(robot: RobotDescription, model: Model, law: TorqueLaw, shape: tuple[int, ...]) -> Scene:
-    """What the terms of a batch know of their simulations."""
-    own = model.compiled.dof_armature[model.dofs]
-    armature = np.broadcast_to(own if law.armature is None else law.armature, shape).copy()
-    inertia = joint_inertia(model, law.armature, shape)
-    return Scene(robot, model, robot.timestep, inertia, armature, np.broadcast_to(law.limit, shape))
-
-
-def _longest(terms: Sequence[Term], hook: str, timestep: float) -> Array | None:
-    """How old readings are by all terms together, in sub-steps; None where none says."""
-    ages = [getattr(term, hook)() for term in terms if term.answers(hook)]
-    return sum(ages) / timestep if ages else None
-
-
-def _mount(robot: RobotDescription, model: Model) -> Array:
-    """The IMU's orientation in the torso."""
-    if robot.imu_site is None:
-        return np.array([1.0, 0, 0, 0])
-    return np.array(model.compiled.site(robot.imu_site).quat)

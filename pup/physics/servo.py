@@ -5,15 +5,13 @@ servo's limits; and what leaves the servo passes the gear on its way to the link
 of these. Without any, this is the torque law alone.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.actuators import TorqueLaw
-from pup.physics.commands import Commands, Target
+from pup.physics.commands import Commands, LiveCommands, Target
 from pup.physics.limited import LimitedLaw
-from pup.physics.terms.base import Drive, Flow, Scene, Term
+from pup.physics.outfit import Outfit
+from pup.physics.terms.base import Drive, Flow, Term
 
 Array = NDArray[np.float64]
 
@@ -24,44 +22,41 @@ class Servos:
     Simulations stand recording by recording, candidate by candidate; those running are the first.
 
     Args:
-      law: the torque law.
-      commands: of the recordings.
-      power: share of each sub-step with the torque on, shape (n_steps, n_recordings).
-      terms: what acts beside the law.
-      scene: what the simulations have in common.
-      viscous: damping outside the servos, shape (n_simulations, n_joints), N m s/rad.
+      outfit: the torque law and what acts beside it.
+      commands: of the recordings, or told as the simulations go.
+      power: share of each sub-step with the torque on, shape (n_steps, n_recordings); None for 1.
       delay: of the commands, shape (n_simulations,), s; None where there is none.
       candidates: how many there are.
     """
 
     def __init__(
         self,
-        law: TorqueLaw,
-        commands: Commands,
-        power: Array,
-        terms: Sequence[Term],
-        scene: Scene,
-        viscous: Array,
+        outfit: Outfit,
+        commands: Commands | LiveCommands,
+        power: Array | None,
         delay: Array | None,
         candidates: int,
     ) -> None:
-        self.law = law
-        self.limited = LimitedLaw(law, scene.inertia, viscous, scene.timestep)
+        self.law, self.scene, self.viscous = outfit.law, outfit.scene, outfit.viscous
+        self.limited = LimitedLaw(self.law, self.scene.inertia, self.viscous, self.scene.timestep)
         self.commands = commands
-        self.power = None if (power == 1).all() else power
-        self.scene = scene
-        self.viscous = viscous
+        self.power = None if power is None or (power == 1).all() else power
         self.delay = None if delay is None else delay[:, None]
         self.candidates = candidates
 
         def of(hook: str) -> list[Term]:
-            return [term for term in terms if term.answers(hook)]
+            return [term for term in outfit.terms if term.answers(hook)]
 
         self.late, self.commanding, self.sensing = of("lateness"), of("command"), of("sense")
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
-        self._before: Array | None = None
+        self.before: Array | None = None
         self.loaded = any(term.loaded for term in self.flowing)
+
+    def begin(self) -> None:
+        """Let the next sub-step be the first."""
+        self.limited.begin()
+        self.before = None
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """What the encoders tell of the links' positions and velocities."""
@@ -71,7 +66,7 @@ class Servos:
 
     def torque(
         self,
-        step: int,
+        step: int | Array,
         link: tuple[Array, Array],
         sensed: tuple[Array, Array],
         bias: Array | None,
@@ -80,7 +75,7 @@ class Servos:
         """What reaches the links in one sub-step.
 
         Args:
-          step: the sub-step.
+          step: the sub-step; where simulations have one each, shape (n_simulations, 1).
           link: positions (rad) and velocities (rad/s) of the links, each (n_active, n_joints).
           sensed: the same as the encoders tell them.
           bias: torques of gravity and motion, same shape, N m; None where no term asks for them.
@@ -89,10 +84,10 @@ class Servos:
         Returns:
           The applied torque (N m) and the viscous coefficient (N m s/rad), both of that shape.
         """
-        time = step * self.scene.timestep
+        time: float | Array = step * self.scene.timestep
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
-        outside = None if still or step == 0 else self.limited.outside(sensed[1])
+        outside = None if still else self.limited.outside(sensed[1])
         error, torque, damping = self._answer(target.now, sensed, outside, time)
         if target.before is not None:
             share = self._spread(target.share, running)
@@ -109,7 +104,7 @@ class Servos:
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
         if self.flowing:
-            return self._through_gears(step, link, sensed[1], bias, (torque, damping), still)
+            return self._through_gears(time, link, sensed[1], bias, (torque, damping), still)
         damping = damping + self.viscous[: len(damping)]
         implicit = self._implicit(damping, still)
         if implicit is not None:
@@ -125,7 +120,7 @@ class Servos:
 
     def _through_gears(
         self,
-        step: int,
+        time: float | Array,
         link: tuple[Array, Array],
         sensed: Array,
         bias: Array | None,
@@ -142,18 +137,17 @@ class Servos:
             brake = (1 - share) * (viscous * sensed)
             viscous = share * viscous
         now = link[1]
-        before = now if step == 0 or self._before is None else self._before[: len(now)]
-        self._before = now.copy()
-        time = step * self.scene.timestep
+        before = now if self.before is None else self.before[: len(now)]
+        self.before = now.copy()
         flow = Flow(time, *link, 2 * now - before, bias, torque, damping, brake, viscous)
         for term in self.flowing:
             term.flow(flow)
         return flow.torque - flow.brake, flow.damping + flow.viscous
 
-    def _target(self, step: int, running: int, time: float) -> Target:
+    def _target(self, step: int | Array, running: int, time: float | Array) -> Target:
         n = running * self.candidates
         if self.delay is None and not self.late:
-            target = self.commands.on_time(step, running)
+            target = self.commands.on_time(step, running)  # type: ignore[arg-type]
         else:
             lateness = 0.0 if self.delay is None else self.delay[:n]
             for term in self.late:
@@ -177,7 +171,11 @@ class Servos:
         return full.reshape(running * self.candidates, -1)
 
     def _answer(
-        self, target: Array, sensed: tuple[Array, Array], outside: Array | None, time: float
+        self,
+        target: Array,
+        sensed: tuple[Array, Array],
+        outside: Array | None,
+        time: float | Array,
     ) -> tuple[Array, Array, Array]:
         """The law's error, torque and viscous coefficient for one target."""
         position, velocity = sensed

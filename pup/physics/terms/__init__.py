@@ -236,12 +236,13 @@ def described(spec: TermSpec) -> ParameterSpace:
     )
 
 
-def bind_terms(candidates: Candidates, scene: Scene) -> list[Term]:
+def bind_terms(candidates: Candidates, scene: Scene, dormant: bool = False) -> list[Term]:
     """The terms that act in some simulations, in the order in which they act.
 
     Args:
       candidates: one row per simulation.
       scene: what the simulations have in common.
+      dormant: whether to bind those too that act in none, for they may later.
     """
     named: dict[str, list[tuple[str, str, Place]]] = {}
     for name in candidates.space.names:
@@ -252,7 +253,8 @@ def bind_terms(candidates: Candidates, scene: Scene) -> list[Term]:
     for effect, term in (TERMS | BEYOND).items():
         columns = named.get(effect, [])
         sizes = {q.name for q in term.magnitudes()}
-        if any(candidates[name].any() for name, quantity, _ in columns if quantity in sizes):
+        sized = [name for name, quantity, _ in columns if quantity in sizes]
+        if any(dormant or candidates[name].any() for name in sized):
             bound.append(term(_values(term, columns, candidates, scene), scene))
     parts = [term for term in bound if isinstance(term, Transmission)]
     if parts:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.terms.base import Drive, Flow, Quantity, Term
+from pup.physics.terms.base import Drive, Flow, Quantity, Term, begin
 
 Array = NDArray[np.float64]
 
@@ -44,27 +44,26 @@ class ActuatorLag(Term):
     effect = "actuator_lag"
     quantities = (Quantity("time", "s", 0.008, 0.06),)
     source = "estimate: 5 to 15 ms of current loop and filters"
+    state = ("_lagging", "_torque", "_damping")
 
     def prepare(self) -> None:
         """See Term."""
         steps = self.scene.timestep / np.maximum(self.values["time"], 1e-9)
         self._kept = np.exp(-steps)
         self._share = 1 - (1 - self._kept) / steps
-        self._lagging: Array | None = None
-        self._asked = np.zeros_like(steps), np.zeros_like(steps)
+        self._lagging = np.full_like(steps, np.nan)
+        self._torque, self._damping = np.zeros_like(steps), np.zeros_like(steps)
 
     def flow(self, flow: Flow) -> None:
         """See Term: what is applied is the mean over the sub-step."""
         n = len(flow.torque)
-        torque, damping = (part[:n] for part in self._asked)
-        if self._lagging is None:
-            self._lagging = flow.torque - flow.damping * flow.velocity
-        else:  # what the last sub-step came to, by the velocity at its end
-            asked = torque - damping * flow.velocity
-            self._lagging[:n] = asked + self._kept[:n] * (self._lagging[:n] - asked)
+        torque, damping, lagging = self._torque[:n], self._damping[:n], self._lagging[:n]
+        # What the last sub-step came to, by the velocity at its end.
+        asked = torque - damping * flow.velocity
+        lagging[:] = asked + self._kept[:n] * (lagging - asked)
+        begin(lagging, flow.torque - flow.damping * flow.velocity)
         torque[:], damping[:] = flow.torque, flow.damping
         active, share = self.values["time"][:n] > 0, self._share[:n]
-        lagging = self._lagging[:n]
         np.copyto(flow.torque, lagging + share * (torque - lagging), where=active)
         np.copyto(flow.damping, share * damping, where=active)
 
@@ -76,6 +75,7 @@ class VoltageSag(Term):
     kinds = ("bus",)
     quantities = (Quantity("drop", "1/(N m)", 0.03, 0.5),)
     source = "estimate: 5 to 15 % under the load of several joints"
+    state = ("_left",)
 
     def prepare(self) -> None:
         """See Term."""
@@ -137,6 +137,7 @@ class IntegralAction(Term):
     effect = "integral_action"
     quantities = (Quantity("gain", "N m/(rad s)", 15.0, 300.0),)
     source = "estimate: an integral gain that takes a second to double the proportional part"
+    state = ("_sum",)
 
     def prepare(self) -> None:
         """See Term."""
@@ -187,6 +188,7 @@ class TargetRateLimit(Term):
         Quantity("sluggishness", "s2/rad", 0.005, 0.1),
     )
     source = "3 to 5 rad/s; BAM (arXiv:2410.08650) has it in the STS3215; 200 rad/s2: an estimate"
+    state = ("_goal", "_speed")
 
     def prepare(self) -> None:
         """See Term."""
@@ -194,14 +196,13 @@ class TargetRateLimit(Term):
         self._rate = 1 / np.maximum(slowness, 1e-9)
         self._acceleration = 1 / np.maximum(sluggishness, 1e-9)
         self._limited = (slowness > 0) | (sluggishness > 0)
-        self._goal: Array | None = None
+        self._goal = np.full_like(slowness, np.nan)
         self._speed = np.zeros_like(slowness)
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term."""
         n = len(now)
-        if self._goal is None:
-            self._goal = before.copy()
+        begin(self._goal[:n], before)
         limited = self._limited[:n]
         earlier = self._moved(before, self.scene.timestep * (1 - share))
         later = self._moved(now, self.scene.timestep * share)
@@ -209,7 +210,6 @@ class TargetRateLimit(Term):
 
     def _moved(self, target: Array, time: Array | float) -> Array:
         """Move the goals towards targets for some time; their mean on the way."""
-        assert self._goal is not None
         n = len(target)
         goal, speed = self._goal[:n], self._speed[:n]
         rate, acceleration = self._rate[:n], self._acceleration[:n]

@@ -8,7 +8,7 @@ zero. A term acts on a batch of simulations at once, at any of its places, throu
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,8 @@ class Scene:
     Attributes:
       robot: the robot.
       model: its compiled model.
-      timestep: sub-step, s.
+      timestep: sub-step, s; where simulations have one each, shape (n_simulations, 1), and all of
+        them are always active.
       inertia: what each servo moves in the model's own pose, kg m²; like the others of shape
         (n_simulations, n_joints).
       armature: the rotors' share of it, kg m².
@@ -76,10 +77,18 @@ class Scene:
 
     robot: RobotDescription
     model: Model
-    timestep: float
+    timestep: float | Array
     inertia: Array
     armature: Array
     limit: Array
+
+    def renew(self, rows: NDArray[np.int64], other: "Scene") -> None:
+        """Give some simulations what another scene, which has one row for each, says.
+
+        The limit is the torque law's and changes with it.
+        """
+        self.inertia[rows], self.armature[rows] = other.inertia, other.armature
+        np.asarray(self.timestep)[rows] = other.timestep
 
 
 @dataclass
@@ -87,7 +96,7 @@ class Drive:
     """A servo's static law in the making; arrays of shape (n_active, n_joints).
 
     Attributes:
-      time: since the recording's start, s.
+      time: since the recording's start, s; or since each simulation's own, shape (n_active, 1).
       error: target minus sensed position, rad.
       velocity: sensed, rad/s.
       torque: of the proportional part, N m.
@@ -97,7 +106,7 @@ class Drive:
         for the speed at the sub-step's end.
     """
 
-    time: float
+    time: float | Array
     error: Array
     velocity: Array
     torque: Array
@@ -111,7 +120,7 @@ class Flow:
     """A torque on its way from the servo to the link; arrays of shape (n_active, n_joints).
 
     Attributes:
-      time: since the recording's start, s.
+      time: since the recording's start, s; or since each simulation's own, shape (n_active, 1).
       position: of the link, rad.
       velocity: of the link, rad/s.
       coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
@@ -123,7 +132,7 @@ class Flow:
       viscous: the part of that damping applied times the velocity at the end, N m s/rad.
     """
 
-    time: float
+    time: float | Array
     position: Array
     velocity: Array
     coming: Array
@@ -149,6 +158,8 @@ class Term:
       layout: what the columns of the values are: the joints, the joints that carry a body, the
         model's bodies, the feet and the floor, or one for all.
       loaded: whether it needs `Flow.bias`.
+      state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
+        one has just started and a first sub-step says what they begin with.
 
     Args:
       values: each quantity, shape (n_simulations, n_places), see `layout`.
@@ -161,6 +172,7 @@ class Term:
     source: ClassVar[str]
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
     loaded: ClassVar[bool] = False
+    state: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, values: Mapping[str, Array], scene: Scene) -> None:
         self.values = values
@@ -169,6 +181,15 @@ class Term:
 
     def prepare(self) -> None:
         """Make the term's state."""
+
+    def renew(self, rows: NDArray[np.int64], other: Self) -> None:
+        """Give some simulations the values and the state of another term, one row for each."""
+        for name, theirs in vars(other).items():
+            own = getattr(self, name)
+            if isinstance(own, np.ndarray):
+                own[rows] = theirs
+        for name, values in other.values.items():
+            self.values[name][rows] = values
 
     def fields(self, writer: FieldWriter) -> None:
         """Write model fields."""
@@ -191,8 +212,15 @@ class Term:
         """
         raise NotImplementedError
 
-    def lateness(self, time: float, n: int) -> Array:
+    def lateness(self, time: float | Array, n: int) -> Array:
         """By how much commands come late, (n, n_joints) or (n, 1), s."""
+        raise NotImplementedError
+
+    def pace(self) -> Array:
+        """How fast the clock of commands goes, (n_simulations, 1); what `lateness` comes of.
+
+        Who sends commands as time goes by sends them faster.
+        """
         raise NotImplementedError
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
@@ -250,3 +278,8 @@ class Term:
     def magnitudes(cls) -> tuple[Quantity, ...]:
         """The quantities that are zero in the nominal model."""
         return tuple(q for q in cls.quantities if not q.shape)
+
+
+def begin(kept: Array, value: Array) -> None:
+    """Let what is NaN in a state, for its simulation has just started, begin with a value."""
+    np.copyto(kept, value, where=np.isnan(kept))

@@ -20,6 +20,8 @@ class Friction(Term):
     is, the joint rests where friction holds it.
     """
 
+    state = ("_bend",)
+
     def prepare(self) -> None:
         """See Term."""
         self._bend = np.zeros_like(self.scene.inertia)

@@ -9,11 +9,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.terms.base import Flow, Quantity, Term
+from pup.physics.terms.base import Flow, Quantity, Term, begin
 
 Array = NDArray[np.float64]
 
@@ -156,6 +157,7 @@ class LearnedLaw(Term):
         for name in FEATURES
     )
     source = "regression of a diagnosis"
+    state = ("_error", "_torque", "_age", "_target")
 
     def prepare(self) -> None:
         """See Term."""
@@ -163,13 +165,18 @@ class LearnedLaw(Term):
         self._error = np.zeros_like(self.scene.inertia)
         self._torque = np.zeros_like(self.scene.inertia)
         self._age = np.full_like(self.scene.inertia, OLDEST)
-        self._target: Array | None = None
+        self._target = np.full_like(self.scene.inertia, np.nan)
+
+    def renew(self, rows: NDArray[np.int64], other: Self) -> None:
+        """See Term."""
+        super().renew(rows, other)
+        known = {*self._features, *other._features}
+        self._features = [name for name in FEATURES if name in known]
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term: only the commands' age is taken note of."""
         n = len(now)
-        if self._target is None:
-            self._target = now.copy()
+        begin(self._target[:n], now)
         self._age[:n] += self.scene.timestep
         np.copyto(self._age[:n], 0.0, where=now != self._target[:n])
         self._target[:n] = now

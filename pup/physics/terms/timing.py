@@ -16,7 +16,7 @@ class CommandDelay(Term):
     quantities = (Quantity("time", "s", 0.012, 0.08),)
     source = "9.5 ms (PACE, issue 19), 5 to 20 ms (unitree_sim_isaaclab, issue 108)"
 
-    def lateness(self, time: float, n: int) -> Array:
+    def lateness(self, time: float | Array, n: int) -> Array:
         """See Term."""
         return self.values["time"][:n]
 
@@ -30,6 +30,10 @@ class ClockSkew(Term):
     quantities = (Quantity("share", "1", 0.002, 0.02, signed=True),)
     source = "estimate: 0.1 to 0.5 %"
 
-    def lateness(self, time: float, n: int) -> Array:
+    def lateness(self, time: float | Array, n: int) -> Array:
         """See Term."""
         return -time * self.values["share"][:n]
+
+    def pace(self) -> Array:
+        """See Term."""
+        return 1 + self.values["share"]

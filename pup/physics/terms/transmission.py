@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.implicit import implicit_share
-from pup.physics.terms.base import Flow, Quantity, Scene, Term
+from pup.physics.terms.base import Flow, Quantity, Scene, Term, begin
 from pup.physics.writer import FieldWriter
 
 Array = NDArray[np.float64]
@@ -39,13 +39,13 @@ class Drivetrain(Term):
     and as play and give go to nothing the rotor's inertia goes back to the link. The servo's and
     the joint's damping act on the motor.
 
-    Attributes:
-      rows: the simulations that have any.
-
     Args:
       parts: the play and the give.
       scene: what they act on.
     """
+
+    effect = "drivetrain"
+    state = ("_position", "_velocity", "_free", "_heft", "_torque", "_damping")
 
     def __init__(self, parts: Sequence[Transmission], scene: Scene) -> None:
         self._gap = np.asarray(sum(part.gap() for part in parts))
@@ -57,9 +57,13 @@ class Drivetrain(Term):
         self._play_seen = play / np.maximum(self._gap, 1e-12)
         self._bend_seen = bend / np.maximum(self._give, 1e-12)
         self._active = (self._gap > 0) | (self._give > 0)
-        self.rows = np.flatnonzero(self._active.any(axis=1)).astype(np.int32)
-        self._first: Array | None = None
+        self._first = np.full_like(self._gap, np.nan)
         super().__init__({}, scene)
+
+    @property
+    def rows(self) -> NDArray[np.int32]:
+        """The simulations that have any."""
+        return np.asarray(np.flatnonzero(self._active.any(axis=1)), dtype=np.int32)
 
     def prepare(self) -> None:
         """See Term."""
@@ -67,11 +71,11 @@ class Drivetrain(Term):
         self._rotor = np.maximum(self.scene.armature, 1e-7) / step
         implicit = implicit_share(step / np.maximum(self._give, 1e-9), self._rotor * step, step)
         self._reach = implicit * step + np.where(self._give > 0, RELAXATION, 0.0)
-        self._position: Array | None = None
+        self._position = np.full_like(self._gap, np.nan)
         self._velocity = np.zeros_like(self._gap)
         self._free = np.zeros_like(self._gap)
         self._heft = np.ones_like(self._gap)
-        self._sent = np.zeros_like(self._gap), np.zeros_like(self._gap)
+        self._torque, self._damping = np.zeros_like(self._gap), np.zeros_like(self._gap)
 
     def fields(self, writer: FieldWriter) -> None:
         """See Term: the rotor leaves the link."""
@@ -82,16 +86,15 @@ class Drivetrain(Term):
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
         n = len(position)
-        if self._position is None:
-            self._position = position.copy()
-            self._velocity[:] = velocity if self._first is None else self._first
-        else:
-            torque, damping = (part[:n] for part in self._sent)
-            carried = torque - damping * velocity
-            self._velocity[:n] = self._free[:n] - carried / self._heft[:n]
-            self._position[:n] += self.scene.timestep * self._velocity[:n]
+        own, speed = self._position[:n], self._velocity[:n]
+        carried = self._torque[:n] - self._damping[:n] * velocity
+        speed[:] = self._free[:n] - carried / self._heft[:n]
+        np.copyto(speed, self._first[:n], where=np.isnan(own))
+        np.copyto(speed, velocity, where=np.isnan(speed))
+        own += self.scene.timestep * speed
+        begin(own, position)
         active, gap = self._active[:n], self._gap[:n]
-        ahead = self._position[:n] - position
+        ahead = own - position
         play = np.clip(ahead, -gap, gap)
         told = position + self._play_seen[:n] * play + self._bend_seen[:n] * (ahead - play)
         return np.where(active, told, position), np.where(active, self._velocity[:n], velocity)
@@ -109,7 +112,6 @@ class Drivetrain(Term):
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        assert self._position is not None
         n, step = len(flow.torque), self.scene.timestep
         active, gap, heft, reach = self._active[:n], self._gap[:n], self._heft[:n], self._reach[:n]
         rotor = self._rotor[:n]
@@ -123,8 +125,7 @@ class Drivetrain(Term):
         beyond = ahead - np.copysign(gap, coming)
         torque = np.where(touching, grip * (beyond / reach + self._free[:n]), 0.0)
         damping = np.where(touching, grip, 0.0)
-        for sent, part in zip(self._sent, (torque, damping), strict=True):
-            sent[:n] = part
+        self._torque[:n], self._damping[:n] = torque, damping
         np.copyto(flow.torque, torque, where=active)
         np.copyto(flow.damping, damping, where=active)
         flow.brake = np.where(active, 0.0, flow.brake)
