@@ -81,8 +81,8 @@ def both_ways(
     simulator = MujocoSimulator(DARWIN, [run], actuator)
     replayed = simulator.replay(candidates)
     begun = _Run(DARWIN, simulator.groups[0], candidates, simulator.law)
-    n, nominal = len(candidates), candidates.rows(slice(1))
-    ours = Simulations(DARWIN, nominal, actuator, n, SUBSTEPS, PERIOD, 1)
+    n, largest = len(candidates), candidates.space.candidates(candidates.values.max(axis=0))
+    ours = Simulations(DARWIN, largest, actuator, n, SUBSTEPS, PERIOD, 1)
     ours.start(
         np.arange(n), candidates, np.full(n, PERIOD / SUBSTEPS * clock), begun.qpos, begun.qvel
     )

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.locomotion.task import WalkingTask
+from pup.locomotion.task import Action, WalkingTask
 
 Array = NDArray[np.float64]
-Policy = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.integer]]
-"""From proprioception and parameters, a row per simulation, to bins, shape (n, n_joints)."""
+Policy = Callable[[NDArray[np.float32], NDArray[np.float32]], Action]
+"""From proprioception and parameters, a row per simulation, to actions, shape (n, n_joints)."""
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,12 @@ class ParameterSampler:
         drawn = rng.uniform(-MARGIN, 1 + MARGIN, shape)
         return np.clip(drawn, self._lowest, self._highest)
 
+    def largest(self) -> Candidates:
+        """All of the robot's parameters, no smaller than any that will be drawn; one row."""
+        if self.mu is not None:
+            return self.candidates(self.unit(np.atleast_2d(self.mu).max(axis=0))[None])
+        return self.candidates(np.minimum(1 + MARGIN, self._highest)[None])
+
     def unit(self, mu: Array) -> Array:
         """Physical values on the unit scale of the bounds, shape (..., n_parameters)."""
         return np.asarray((mu - self.bounds.lower) / self._width)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pup.physics.actuators import LAWS
 from pup.physics.limited import LimitedLaw
 from pup.physics.live import LiveServos, has_terms, paced
-from pup.physics.model import FLOOR, Model, compile_model, joint_inertia, standing_qpos
+from pup.physics.model import FLOOR, compile_model, joint_inertia, lowest_point
 from pup.physics.outfit import Outfit, fit_out
 from pup.physics.parameters import Candidates
 from pup.physics.writer import RowWriter
@@ -84,7 +84,8 @@ class Simulations:
 
     Args:
       robot: has a free torso, a floor under it and a gait.
-      nominal: the robot's parameters, for the torque law `actuator`; one row.
+      largest: the robot's parameters, for the torque law `actuator`, one row: none that will come
+        is larger.
       actuator: `nn_pd` or `pd`.
       n: simulations.
       substeps: per control step.
@@ -95,7 +96,7 @@ class Simulations:
     def __init__(
         self,
         robot: RobotDescription,
-        nominal: Candidates,
+        largest: Candidates,
         actuator: str,
         n: int,
         substeps: int,
@@ -106,7 +107,7 @@ class Simulations:
         edges = np.linspace(0, n, threads + 1).astype(np.int64)
         self._edges = edges
         self._parts = [
-            _Part(robot, nominal, actuator, int(b - a), substeps, period)
+            _Part(robot, largest, actuator, int(b - a), substeps, period)
             for a, b in pairwise(edges)
         ]
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
@@ -182,7 +183,7 @@ class _Part:
     def __init__(
         self,
         robot: RobotDescription,
-        nominal: Candidates,
+        largest: Candidates,
         actuator: str,
         n: int,
         substeps: int,
@@ -193,10 +194,10 @@ class _Part:
         self.model = compile_model(robot, "ground", _sense)
         self.batch = mujoco.batch.Batch(self.model.compiled, n, 1)
         self.make = LAWS[actuator]
-        candidates = nominal.space.candidates(np.repeat(nominal.values, n, axis=0))
+        candidates = Candidates(largest.space, np.repeat(largest.values, n, axis=0))
         law = self.make(robot, candidates)
         self.live: LiveServos | None = None
-        if has_terms(nominal.space):
+        if has_terms(largest.space):
             self.live = LiveServos(robot, self.model, law, candidates, period, substeps)
             self.limited = self.live.servos.limited
         else:
@@ -226,10 +227,10 @@ class _Part:
         outfit = fit_out(
             self.robot, model, law, candidates, self.setups, writer, timestep[:, None].copy(), True
         )
-        paced(outfit)
+        paced(outfit.terms, outfit.scene)
         writer.field("opt.timestep")[:] = np.asarray(outfit.scene.timestep)[:, 0]
         writer.done()
-        qpos = _as_it_stands(self.robot, model, outfit, qpos)
+        qpos = self._as_it_stands(ids, outfit, qpos)
         self.qpos[rows], self.qvel[rows] = qpos, qvel
         if self.live is None:
             scene = outfit.scene
@@ -242,6 +243,23 @@ class _Part:
                 self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
             self.live.start(rows, outfit, candidates, link, qpos[:, 3:7], self._bias(rows))
         return self._pose(rows)
+
+    def _as_it_stands(self, ids: NDArray[np.int32], outfit: Outfit, qpos: Array) -> Array:
+        """States where encoders read the given ones; the torso is set on the floor again."""
+        model = self.model
+        position, unread = qpos[:, model.qpos].copy(), np.full((len(qpos), 4), np.nan)
+        for term in reversed(outfit.terms):
+            term.start(position, unread)
+        off = np.flatnonzero((position != qpos[:, model.qpos]).any(axis=1))
+        if not len(off):
+            return qpos
+        qpos, ids = qpos.copy(), ids[off]
+        qpos[:, model.qpos] = position
+        self.qpos[ids] = qpos[off]
+        self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_POS)
+        places, axes = self.batch.bind("geom_xpos"), self.batch.bind("geom_xmat")
+        qpos[off, 2] -= lowest_point(model.compiled, places[ids], axes[ids])
+        return qpos
 
     def _push(self, ids: NDArray[np.int32], outfit: Outfit) -> None:
         """Apply the terms' wrenches."""
@@ -323,19 +341,6 @@ class _Part:
         self.limited.restore(state)
         if self.live is not None:
             self.live.restore(state)
-
-
-def _as_it_stands(robot: RobotDescription, model: Model, outfit: Outfit, qpos: Array) -> Array:
-    """States (k, nq) where encoders read the given ones; the torso is set on the floor again."""
-    position, unread = qpos[:, model.qpos].copy(), np.full((len(qpos), 4), np.nan)
-    for term in reversed(outfit.terms):
-        term.start(position, unread)
-    off = np.flatnonzero((position != qpos[:, model.qpos]).any(axis=1))
-    if len(off):
-        qpos = qpos.copy()
-        for row in off:
-            qpos[row] = standing_qpos(robot, model, position[row], qpos[row, 3:7])
-    return qpos
 
 
 def _sense(robot: RobotDescription, spec: mujoco.MjSpec) -> None:

@@ -24,6 +24,8 @@ from pup.robot import Gait, RobotDescription
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.int64]
+Action = NDArray[np.integer] | NDArray[np.floating]
+"""Bins, or between them, 0 to bins - 1."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ class WalkingTask:
         bounds = sampler.bounds
         self._simulations = Simulations(
             robot,
-            bounds.space.candidates(),
+            sampler.largest(),
             bounds.actuator,
             n,
             settings.substeps,
@@ -170,11 +172,11 @@ class WalkingTask:
         self._restart(np.arange(self.n))
         return self._observation()
 
-    def step(self, action: NDArray[np.integer]) -> Step:
+    def step(self, action: Action) -> Step:
         """Move every robot by one control step.
 
         Args:
-          action: bins, shape (n, n_joints), each 0 to bins - 1.
+          action: shape (n, n_joints), each 0 to bins - 1.
         """
         episodes, live = self._episodes, ~self._episodes.over
         reference = self.reference.angles(episodes.time)
@@ -261,7 +263,7 @@ class WalkingTask:
         parameters = self.sampler.candidates(self._episodes.mu[rows])
         return self._simulations.start(rows, parameters, timestep, qpos, qvel)
 
-    def _target(self, reference: Array, action: NDArray[np.integer]) -> Array:
+    def _target(self, reference: Array, action: Action) -> Array:
         """Reference + reach times the mean of the latest actions, within the joint limits."""
         episodes, settings = self._episodes, self.settings
         latest = 2.0 / (self.bins - 1) * action - 1.0

@@ -49,7 +49,8 @@ class _Held:
         now, told = self._held_at(end)
         before, _ = self._held_at((step - 0.5) * self.timestep - lateness)
         since = (end - told) / self.timestep
-        return Target(now, before, np.where(now == before, 1.0, np.clip(since, 0, 1)))
+        share = np.where(now == before, 1.0, np.clip(since, 0, 1))
+        return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
 
     def _held_at(self, time: Array) -> tuple[Array, Array]:
         """What is held at some times, and since when."""
@@ -157,12 +158,9 @@ class LiveCommands(_Held):
         return super().late(np.asarray(step)[:, :, None], np.maximum(lateness, 0.0))
 
     def _held_at(self, time: Array) -> tuple[Array, Array]:
-        held, told = self.held[:, 0, None], self.told[:, 0, None, None]
-        for age in range(1, self.held.shape[1]):
-            early = time < self.told[:, age - 1, None, None]
-            held = np.where(early, self.held[:, age, None], held)
-            told = np.where(early, self.told[:, age, None, None], told)
-        return held, told
+        age = (time < self.told[:, :-1, None]).sum(axis=1, keepdims=True)
+        told = np.take_along_axis(self.told[:, :, None], age, axis=1)
+        return np.take_along_axis(self.held, age, axis=1), told
 
 
 def _changes(plan: Schedule) -> tuple[Array, Array]:

@@ -5,6 +5,8 @@ starts anew when its time has come, has a sub-step of its own, and is told one t
 What acts in it is the same: `Servos`, and the terms with their hooks.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,7 @@ from pup.physics.model import Model
 from pup.physics.outfit import Outfit, as_the_imu_tells, longest, scene_of
 from pup.physics.parameters import Candidates, ParameterSpace
 from pup.physics.servo import Servos
-from pup.physics.terms import bind_terms, split_column
+from pup.physics.terms import Scene, Term, bind_terms, split_column
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
@@ -30,11 +32,11 @@ def has_terms(space: ParameterSpace) -> bool:
     return any(name == DELAY or split_column(name) is not None for name in space.names)
 
 
-def paced(outfit: Outfit) -> None:
+def paced(terms: Sequence[Term], scene: Scene) -> None:
     """Shorten the sub-steps, in place, where the clock that commands come by goes fast."""
-    for term in outfit.terms:
+    for term in terms:
         if term.answers("pace"):
-            np.asarray(outfit.scene.timestep)[:] /= term.pace()
+            np.asarray(scene.timestep)[:] /= term.pace()
 
 
 class LiveServos:
@@ -47,8 +49,7 @@ class LiveServos:
       robot: the robot.
       model: its compiled model.
       law: bound to the simulations.
-      candidates: parameters, one row for each simulation; those of the starts may differ, within
-        the search ranges.
+      candidates: parameters, one row for each simulation, no smaller than any that will come.
       period: shortest time between two targets, s.
       substeps: of that time.
     """
@@ -62,17 +63,14 @@ class LiveServos:
         period: float,
         substeps: int,
     ) -> None:
-        n, joints, space = len(candidates), len(robot.joints), candidates.space
+        n, joints = len(candidates), len(robot.joints)
         scene = scene_of(robot, model, law, n, np.full((n, 1), period / substeps))
         self.terms = tuple(bind_terms(candidates, scene, dormant=True))
         acting = tuple(term for term in self.terms if not term.answers("pace"))
         delay = np.zeros(n) if DELAY in candidates else None
-        # Of each parameter the largest value: it says how much of the past is to be kept.
-        most = Candidates(space, np.tile(np.maximum(space.upper, space.nominal), (n, 1)))
-        slow = Outfit(law, scene, scene.inertia, tuple(bind_terms(most, scene)))
-        paced(slow)
-        late = most[DELAY].max() if DELAY in most else 0.0
-        late += sum(t.lateness(0.0, n).max() for t in slow.terms if t.answers("lateness"))
+        paced(self.terms, scene)
+        late = candidates[DELAY].max() if DELAY in candidates else 0.0
+        late += sum(term.lateness(0.0, n).max() for term in acting if term.answers("lateness"))
         kept = 2 + int(np.ceil(late / period)) if late > 0 else 1
         self.commands = LiveCommands((n, joints), kept)
         outfit = Outfit(law, scene, np.zeros((n, joints)), acting)
@@ -81,9 +79,7 @@ class LiveServos:
         self.steps = np.zeros((n, 1))
         self.position, self.velocity = np.zeros((n, joints)), np.zeros((n, joints))
         self.bias = np.zeros((n, joints)) if self.servos.loaded else None
-        self.joints, self.torso = (
-            _history(slow, hook, width) for hook, width in (("delay", joints), ("tilt_delay", 4))
-        )
+        self.joints, self.torso = self._history("delay", joints), self._history("tilt_delay", 4)
 
     def start(
         self,
@@ -182,6 +178,13 @@ class LiveServos:
         for name, history in self._histories().items():
             history.restore(state[name])
 
+    def _history(self, hook: str, width: int) -> History | None:
+        """For readings that are old; None where none are."""
+        ages = longest(self.terms, hook)
+        if ages is None:
+            return None
+        return History(len(ages), width, ages / self.servos.scene.timestep)
+
     def _own(self) -> dict[str, Array]:
         """The arrays of the state themselves."""
         assert self.servos.before is not None
@@ -202,11 +205,3 @@ class LiveServos:
     def _histories(self) -> dict[str, History]:
         both = {"read_position": self.joints, "read_torso": self.torso}
         return {name: history for name, history in both.items() if history is not None}
-
-
-def _history(slow: Outfit, hook: str, width: int) -> History | None:
-    """For readings as old as the terms may make them; None where none does."""
-    ages = longest(slow.terms, hook)
-    if ages is None:
-        return None
-    return History(len(slow.viscous), width, ages / slow.scene.timestep)

@@ -6,6 +6,7 @@ word anywhere: a space without such columns is the nominal model.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import get_args
 
 import numpy as np
@@ -172,6 +173,7 @@ def column(effect: str, quantity: str, place: Place) -> str:
     return f"{effect}/{quantity}@{place}"
 
 
+@lru_cache(maxsize=4096)
 def split_column(name: str) -> tuple[str, str, Place] | None:
     """Effect, quantity and place of a column; None for a parameter of another kind."""
     head, at, place = name.partition("@")
@@ -251,8 +253,9 @@ def bind_terms(candidates: Candidates, scene: Scene, dormant: bool = False) -> l
             named.setdefault(told[0], []).append((name, told[1], told[2]))
     bound: list[Term] = []
     for effect, term in (TERMS | BEYOND).items():
-        columns = named.get(effect, [])
-        sizes = {q.name for q in term.magnitudes()}
+        if effect not in named:
+            continue
+        columns, sizes = named[effect], {q.name for q in term.magnitudes()}
         sized = [name for name, quantity, _ in columns if quantity in sizes]
         if any(dormant or candidates[name].any() for name in sized):
             bound.append(term(_values(term, columns, candidates, scene), scene))
