@@ -68,14 +68,14 @@ class Rollout:
         self._offset = card.gait.imu_pitch_offset
         self._start: float | None = None
         self._before: Array | None = None
-        self._bins: list[NDArray[np.int64]] = []
+        self._actions: list[Array] = []
         self.rows: list[Row] = []
 
     @property
     def pose(self) -> Array:
         """That it starts in, rad."""
         shape = self._policy.card.shape
-        return self._policy.targets(0.0, np.full((1, shape.joints), (shape.bins - 1) // 2))
+        return self._policy.targets(0.0, np.full((1, shape.joints), (shape.bins - 1) / 2))
 
     def time(self, now: float) -> float:
         """Since the start of the walk, s."""
@@ -88,9 +88,9 @@ class Rollout:
         now = self._reading(senses)
         seen = np.concatenate([now if self._before is None else self._before, now])
         self._before = now
-        self._bins.append(self._policy.act(seen[self._columns], self._eta))
-        del self._bins[: -self._policy.card.smoothing]
-        return self._policy.targets(self.time(senses.time), np.array(self._bins))
+        self._actions.append(self._policy.act(seen[self._columns], self._eta))
+        del self._actions[: -self._policy.card.smoothing]
+        return self._policy.targets(self.time(senses.time), np.array(self._actions))
 
     def keep(self, senses: Senses, applied: Applied, torque: bool = True) -> None:
         """Add a tick to the recording."""

@@ -64,7 +64,7 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     eta = None if shown.eta is None else _eta(policy, shown.eta)
     settings = TaskSettings(direction=Direction(policy.card.direction)).evaluation()
 
-    def act(seen: NDArray[np.float32], mu: NDArray[np.float32]) -> NDArray[np.int64]:
+    def act(seen: NDArray[np.float32], mu: NDArray[np.float32]) -> Array:
         return policy.act(seen, policy.project(mu) if eta is None else eta)
 
     def task(sampler: ParameterSampler, n: int) -> WalkingTask:

@@ -32,11 +32,11 @@ CLIP, FLOOR = 5.0, 1e-6
 
 @dataclass(frozen=True)
 class PolicyCard:
-    """What a policy is made for, and how its bins become targets.
+    """What a policy is made for, and how its actions become targets.
 
     Attributes:
       robot: name of the robot.
-      joints: in the order of bins and targets.
+      joints: in the order of actions and targets.
       lower: of the targets, rad, shape (n_joints,).
       upper: of the targets.
       method: see Method.
@@ -170,7 +170,7 @@ def _digest(document: dict[str, Any]) -> str:
 
 
 class NumpyPolicy:
-    """Runs a policy in double precision, in which NumPy, torch and ONNX agree on the bins.
+    """Runs a policy in double precision, in which NumPy, torch and ONNX agree.
 
     Args:
       card: what it is.
@@ -207,30 +207,33 @@ class NumpyPolicy:
         flat = _through(self.actor, np.concatenate([seen, eta], axis=-1))
         return flat.reshape(*flat.shape[:-1], self.card.shape.bins, self.card.shape.joints)
 
-    def act(self, proprioception: Array, eta: Array) -> NDArray[np.int64]:
-        """The likeliest bin of each joint.
+    def act(self, proprioception: Array, eta: Array) -> Array:
+        """The mean of the bins of each joint, as the policy weighs them.
 
         Args:
           proprioception: observations as they were measured, shape (..., n_entries).
           eta: shape (n_eta,) or (..., n_eta).
 
         Returns:
-          Bins, shape (..., n_joints).
+          Actions between 0 and bins - 1, shape (..., n_joints).
         """
-        return np.asarray(np.argmax(self.logits(proprioception, eta), axis=-2))
+        logits = self.logits(proprioception, eta)
+        weights = np.exp(logits - logits.max(axis=-2, keepdims=True))
+        order = np.arange(self.card.shape.bins, dtype=np.float64)
+        return np.asarray(order @ weights / weights.sum(axis=-2))
 
-    def targets(self, time: float, bins: NDArray[np.int64]) -> Array:
+    def targets(self, time: float, actions: Array) -> Array:
         """Target positions, rad, shape (n_joints,).
 
         Args:
           time: since the start of the walk, s.
-          bins: the actions so far, the newest last, shape (n_actions, n_joints); those before what
-            the smoothing takes are not looked at.
+          actions: those so far, the newest last, shape (n_actions, n_joints), each between 0 and
+            bins - 1; those before what the smoothing takes are not looked at.
         """
         card = self.card
         middle = (card.shape.bins - 1) / 2
-        action = (np.asarray(bins)[-card.smoothing :] / middle - 1).mean(axis=0)
-        target = self._reference(time) + card.reach * action
+        mean = (np.asarray(actions)[-card.smoothing :] / middle - 1).mean(axis=0)
+        target = self._reference(time) + card.reach * mean
         return np.asarray(np.clip(target, card.lower, card.upper))
 
     def _reference(self, time: float) -> Array:

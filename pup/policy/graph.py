@@ -1,4 +1,4 @@
-"""The policy as an ONNX graph: from `obs` and `eta` to `bins`, in double precision."""
+"""The policy as an ONNX graph: from `obs` and `eta` to `action`, in double precision."""
 
 from typing import Any
 
@@ -23,7 +23,8 @@ def onnx_graph(shape: PolicyShape, weights: Weights) -> bytes:
 
     Returns:
       The model's bytes. Inputs `obs`, float64 (n, n_entries), as measured, and `eta`, float64 (n,
-      n_eta); outputs `bins`, int64 (n, n_joints), and `logits`, float64 (n, n_bins, n_joints).
+      n_eta); outputs `action`, float64 (n, n_joints), the mean
+      of the bins, and `logits`, float64 (n, n_bins, n_joints).
     """
     constants: list[Any] = []
     nodes: list[Any] = []
@@ -52,7 +53,10 @@ def onnx_graph(shape: PolicyShape, weights: Weights) -> bytes:
             here = node("Tanh", [here], f"hidden{i}")
     size = constant("size", np.array([-1, shape.bins, shape.joints], dtype=np.int64))
     node("Reshape", [here, size], "logits")
-    node("ArgMax", ["logits"], "bins", axis=1, keepdims=0)
+    node("Softmax", ["logits"], "weights", axis=1)
+    order = constant("order", np.arange(float(shape.bins))[:, None])
+    weighed = node("Mul", ["weights", order], "weighed")
+    node("ReduceSum", [weighed, constant("bins", np.array([1]))], "action", keepdims=0)
     double = TensorProto.DOUBLE
     graph = helper.make_graph(
         nodes,
@@ -62,7 +66,7 @@ def onnx_graph(shape: PolicyShape, weights: Weights) -> bytes:
             helper.make_tensor_value_info("eta", double, ["n", shape.eta]),
         ],
         [
-            helper.make_tensor_value_info("bins", TensorProto.INT64, ["n", shape.joints]),
+            helper.make_tensor_value_info("action", double, ["n", shape.joints]),
             helper.make_tensor_value_info("logits", double, ["n", shape.bins, shape.joints]),
         ],
         constants,

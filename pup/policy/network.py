@@ -122,9 +122,14 @@ class ProjectedPolicy(torch.nn.Module):
         last.bias.mul_(scale).add_(mean - self.returns.mean).div_(self.returns.scale)
 
 
-def greedy(logits: Tensor) -> Tensor:
-    """The likeliest bin of each joint, shape (n, joints)."""
-    return logits.argmax(dim=-2)
+def expected(logits: Tensor) -> Tensor:
+    """The mean of the bins of each joint, between 0 and bins - 1, shape (n, joints).
+
+    What a policy does when it does not explore. The likeliest bin is a poor stand-in: it stays in
+    the middle until another one has more than a third of the probability.
+    """
+    order = torch.arange(logits.shape[-2], dtype=logits.dtype, device=logits.device)
+    return torch.einsum("...bj,b->...j", torch.softmax(logits, dim=-2), order)
 
 
 def draw(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
