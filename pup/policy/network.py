@@ -17,7 +17,7 @@ CLIP = 5.0
 """Standard deviations at which normalised observations end (the authors' filter)."""
 FLOOR = 1e-6
 """Least variance; an entry that never changes stays near 0."""
-SPREAD = 0.7
+SPREAD = 0.5
 """Standard deviation, in bins about the middle, of the actions of a policy that learnt nothing.
 
 With all bins alike the noise of 20 joints throws the robot before what one of them did can be told
