@@ -97,11 +97,14 @@ class Body:
         Raises:
           BusError: the bus or the IMU is gone.
         """
-        if self.imu is not None:
+        lockstep = self.settings.control.clock == "lockstep"
+        if self.imu is not None and not lockstep:
             self.imu.ask()
         answers = self.bus.read()
         alarms = self._take(answers, now)
         if self.imu is not None:
+            if lockstep:  # only now it is sure that what the bus was told before has passed
+                self.imu.ask()
             sample = self.imu.take(answers.board, now)
             if sample is not None:
                 self._imu, self._imu_seen = sample, now

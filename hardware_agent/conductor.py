@@ -284,6 +284,7 @@ class Conductor:
             self._send(*self._chunks(recording))
         self._send(finished)
         self._reset()
+        self._motion.measured()
 
     def _reset(self) -> None:
         self.stage, self.waiting = Stage.NONE, ""

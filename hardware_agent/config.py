@@ -179,12 +179,15 @@ class DistanceSettings:
       kind: "operator" (asked after a rollout), "hook" (a command) or "virtual" (the virtual robot).
       command: of the hook, called with `start` and with `end`; see `hardware_agent.distance`.
       side: socket of the virtual robot.
+      renew: whether each walk of the virtual robot is the same whatever it has done before: fresh
+        battery, cold motors, noise by the trial's name.
       timeout: of the hook, s.
     """
 
     kind: str = "operator"
     command: tuple[str, ...] = ()
     side: str = ""
+    renew: bool = False
     timeout: float = 30.0
 
 

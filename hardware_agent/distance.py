@@ -3,6 +3,7 @@
 The paper measures by hand, the distance alone, and notes that any other measure would do.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -131,13 +132,13 @@ class Virtual:
     asks = False
 
     def __init__(self, settings: DistanceSettings) -> None:
-        self._path = Path(settings.side)
+        self._path, self._renew = Path(settings.side), settings.renew
         self._axis = AXES["forward"]
 
     def start(self, assign: Assign, direction: str) -> None:
         """See Distance."""
         self._axis = AXES[direction]
-        self._say({"cmd": "reset"})
+        self._say({"cmd": "reset"} | ({"draw": _number(assign.trial)} if self._renew else {}))
 
     def now(self) -> float | None:
         """See Distance."""
@@ -161,3 +162,8 @@ class Virtual:
         if not told.get("ok"):
             raise DistanceError(f"{self._path}: {told.get('error')}")
         return told
+
+
+def _number(trial: str) -> int:
+    """A number that a trial's name stands for, whichever attempt it is."""
+    return int.from_bytes(hashlib.sha256(trial.encode()).digest()[:8], "big")

@@ -2,7 +2,8 @@
 
 Read all sensors, ask the rules of safety, ask the activity for a target, send it. Others talk to it
 by requests, which it takes between two ticks, and hear of it by events; nobody waits for it, and it
-waits for nobody.
+waits for nobody. Only in lock-step, where the robot's time stands still between two commands, does
+it wait for the answer to an event that has one: so a trial does not hang on how long that takes.
 """
 
 import gc
@@ -22,8 +23,10 @@ from hardware_agent.activities import (
     Event,
     Hold,
     Lie,
+    Posed,
     Ramp,
     Settle,
+    Settled,
     Walk,
 )
 from hardware_agent.body import Body
@@ -38,6 +41,8 @@ from pup.wire import AgentState, Assign, Outcome
 
 REOPEN = 1.0  # s between tries to find a bus that is gone
 PRIORITY = 20  # of the real-time scheduler
+STANDSTILL = 10.0  # s, the longest wait for an answer in lock-step
+BEAT = 0.05  # s between two beats meanwhile
 STATISTICS = 33  # ticks between updates of the loop's statistics
 
 
@@ -95,6 +100,7 @@ class Motion(threading.Thread):
         self._body, self._watchdog = body, watchdog
         self._settings = body.settings.control
         self._emit = emit
+        self._events: list[Event] = []
         self.metronome = Metronome(1 / self._settings.rate, self._settings.clock == "lockstep")
         self._requests: queue.SimpleQueue[Callable[[Senses], Refused | None]] = queue.SimpleQueue()
         self._wake = threading.Event()
@@ -141,6 +147,11 @@ class Motion(threading.Thread):
         """End the trial that there is, standing."""
         self._ask(lambda senses: self._cancel(reason))
 
+    def measured(self) -> None:
+        """How far the robot came is known: time may go on where it stood still for that."""
+        if self.metronome.lockstep:
+            self._ask(lambda senses: None)
+
     def close(self) -> None:
         """End the thread; the robot is limp afterwards."""
         self._quit = True
@@ -179,23 +190,50 @@ class Motion(threading.Thread):
         if self._stop_reason is not None:
             self._stopped()
         if not self._bus and not self._reopen():
+            self._tell()
             return
         try:
             walking = isinstance(self._activity, Walk)
             senses = self._body.sense(now, walking)
             if self._body.torque:
                 self._move(senses)
-            while not self._requests.empty():
-                self._requests.get()(senses)
+            self._serve(senses)
         except BusError as error:
             self._bus = False
             self._trip(Trip("bus", str(error)), None)
+            self._tell()
             senses = None
         self.metronome.pace(not isinstance(self._activity, Ramp | Settle | Walk))
         self._count += 1
         if self._count % STATISTICS == 0:
             self._timing = self.metronome.timing()
         self.status = self._told(senses)
+
+    def _serve(self, senses: Senses) -> None:
+        """Tell what happened, and do what is asked."""
+        while (request := self._next(self._tell())) is not None:
+            request(senses)
+
+    def _tell(self) -> float:
+        """Tell what happened; returns for how long time may stand still until it is answered, s."""
+        events, self._events = self._events, []
+        answered = any(isinstance(event, Posed | Settled | Ended) for event in events)
+        if answered and self.metronome.lockstep:
+            with suppress(BusError):
+                self._body.bus.read()  # once this is answered, what was written has passed
+        for event in events:
+            self._emit(event)
+        return STANDSTILL if answered and self.metronome.lockstep else 0.0
+
+    def _next(self, patience: float) -> Callable[[Senses], Refused | None] | None:
+        deadline = time.monotonic() + patience
+        while self._requests.empty() and time.monotonic() < deadline:
+            if self._stop_reason is not None or self._quit:
+                return None
+            self._beat()
+            with suppress(queue.Empty):
+                return self._requests.get(timeout=BEAT)
+        return None if self._requests.empty() else self._requests.get()
 
     def _move(self, senses: Senses) -> None:
         """Ask the rules, then the activity, and send its target."""
@@ -238,7 +276,7 @@ class Motion(threading.Thread):
         if isinstance(activity, Walk):
             self._end_walk(activity, trip, senses, rows_goal)
         elif (trial := _trial(activity)) is not None:
-            self._emit(Ended(trial.assign, Outcome.ABORTED, str(trip), trial.rollout))
+            self._happened(Ended(trial.assign, Outcome.ABORTED, str(trip), trial.rollout))
 
     def _end_walk(self, walk: Walk, trip: Trip, senses: Senses | None, goal: np.ndarray) -> None:
         if senses is not None:
@@ -250,7 +288,7 @@ class Motion(threading.Thread):
             outcome = Outcome.INFEASIBLE
         rows = walk.rollout.rows
         time_walked = rows[-1].time if rows else None
-        self._emit(Ended(walk.assign, outcome, str(trip), walk.rollout, time_walked))
+        self._happened(Ended(walk.assign, outcome, str(trip), walk.rollout, time_walked))
 
     def _stopped(self) -> None:
         self._trip(Trip("stop", self._stop_reason or ""), None)
@@ -290,7 +328,7 @@ class Motion(threading.Thread):
         self._activity = None
         self._state, self._reason = AgentState.DISABLED, ""
         if trial is not None:
-            self._emit(Ended(trial.assign, Outcome.ABORTED, "disabled", trial.rollout))
+            self._happened(Ended(trial.assign, Outcome.ABORTED, "disabled", trial.rollout))
         return None
 
     def _prepare(
@@ -306,7 +344,7 @@ class Motion(threading.Thread):
             self._body.command(begin, senses.time)
             self._body.full_power()
             self._body.guard.reset()
-        settle = Settle(assign, rollout, upright, self._settings, self._emit)
+        settle = Settle(assign, rollout, upright, self._settings, self._happened)
         self._become(Ramp(begin, rollout.pose, self._settings.ramp, settle, AgentState.ARMED))
         return None
 
@@ -324,10 +362,14 @@ class Motion(threading.Thread):
         if isinstance(trial, Walk):
             trial.cancelled = True
         elif trial is not None:
-            self._emit(Ended(trial.assign, Outcome.ABORTED, reason, trial.rollout))
+            self._happened(Ended(trial.assign, Outcome.ABORTED, reason, trial.rollout))
             self._become(Hold(self._body.goal))
 
     # The rest.
+
+    def _happened(self, event: Event) -> None:
+        """Keep what an activity tells until its target is sent."""
+        self._events.append(event)
 
     def _beat(self, torque: bool = False) -> None:
         if self._watchdog is not None:

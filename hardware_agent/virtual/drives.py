@@ -291,6 +291,13 @@ class Drives:
         self.winding[:] = self.case[:] = AMBIENT
         self.refresh()
 
+    def renew(self) -> None:
+        """Motors are cold and batteries as at first; registers stay."""
+        self.charge = self.fresh.copy()
+        self.drawn = np.zeros_like(self.drawn)
+        self.cool()
+        self.volts = self._open.copy()
+
     def heat(self, time: float) -> None:
         """Warm windings and cases up, and drain the battery.
 

@@ -47,7 +47,8 @@ class Imus:
 
     def __init__(self, characters: Sequence[Character]) -> None:
         self._kinds = [character.imu for character in characters]
-        self._rngs = [np.random.default_rng((character.seed, 0x1A0)) for character in characters]
+        self._seeds = [(character.seed, 0x1A0) for character in characters]
+        self._rngs = [np.random.default_rng(seed) for seed in self._seeds]
         self._mounts = [_turn(kind.mount) for kind in self._kinds]
         self._delay = [round(kind.delay / STEP / EVERY) for kind in self._kinds]
         self._past: deque[Sample] = deque(maxlen=max(self._delay) + 1)
@@ -63,6 +64,12 @@ class Imus:
         for sample in self._past:
             for kept, new in zip(vars(sample).values(), vars(now).values(), strict=True):
                 kept[rows] = new[rows]
+
+    def renew(self, number: int) -> None:
+        """Forget the past; noise is drawn anew from a number beside the robots' seeds."""
+        self._rngs = [np.random.default_rng((*seed, number)) for seed in self._seeds]
+        self._past.clear()
+        self._noise = self._draw()
 
     def sample(self, qpos: Array, qvel: Array) -> None:
         """Take a sample; to be called every EVERY steps."""

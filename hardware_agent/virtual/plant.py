@@ -21,6 +21,7 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Joints = int | slice
 HEIGHT = 0.5  # m by which a robot hangs higher than it stands
+BEAT = 20  # steps after which all that happens every so many steps is in step again
 STILL = 0.3  # rad/s below which all joints count as still
 GRIP, TIRED = 0.5, 2.0  # s of a stiff and still robot, and of a stiff one, until a hand lets go
 
@@ -54,6 +55,7 @@ class Plant:
         self.batch.set_models(models)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._force = self.batch.bind("qfrc_applied")
+        self._warmstart = self.batch.bind("qacc_warmstart")
         if robot.floating:
             self._welds = self.batch.bind("eq_active")
             self._hand, self._palm = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
@@ -112,6 +114,22 @@ class Plant:
         self._stiff[rows] = self._still[rows] = 0.0
         if self.imus is not None:
             self.imus.rest(rows, self.qpos, self.qvel)
+
+    def renew(self, number: int) -> None:
+        """Leave nothing of the past but what registers say: full batteries, cold motors.
+
+        Args:
+          number: that the noise of what comes is drawn from, beside the robots' seeds.
+        """
+        self.steps += -self.steps % BEAT
+        for lane, late in enumerate(self._late):
+            for _, joints, goal in late:
+                self.drives.orders.goal[lane, joints] = goal
+            late.clear()
+        self._warmstart[:] = 0.0
+        self.drives.renew()
+        if self.imus is not None:
+            self.imus.renew(number)
 
     def release(self, lane: int) -> None:
         """Let go of a robot that is held."""

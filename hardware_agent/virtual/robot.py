@@ -78,12 +78,17 @@ class VirtualRobot:
         """Simulated time, s."""
         return self.plant.time
 
-    def reset(self, hold: Hold = Hold.HAND) -> None:
+    def reset(self, hold: Hold = Hold.HAND, draw: int | None = None) -> None:
         """Put the robot down in its start pose, as a person would; servos stay as they are told.
 
         Args:
           hold: how it is held there.
+          draw: makes what follows the same whatever came before: a fresh battery, cold motors, and
+            noise drawn from this number and the seed. None leaves all as it is.
         """
+        if draw is not None:
+            self.plant.renew(draw)
+            self._full[:] = 0.0
         self.plant.place([0], hold)
         if self.robot.floating:
             x, y, *_ = map(float, self.plant.qpos[0, :2])

@@ -230,7 +230,10 @@ class Server(AbstractContextManager["Server"]):
         held = str(told.get("hold", "hand")).upper()
         if held not in Hold.__members__:
             raise InputError("reset: hold is hand, rope or not")
-        self.robot.reset(Hold[held])
+        draw = told.get("draw")
+        if draw is not None and (type(draw) is not int or not 0 <= draw < 2**64):
+            raise InputError("reset: draw is a whole number from 0 to 2^64 - 1")
+        self.robot.reset(Hold[held], draw)
         return asdict(self.robot.pose())
 
     def _release(self, told: Mapping[str, Any]) -> None:
