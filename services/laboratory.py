@@ -63,6 +63,7 @@ clock = "lockstep"
 realtime = false
 gate = "auto"
 source = "simulation"
+settle = 2.01
 
 [safety]
 late = 1.0
@@ -73,6 +74,7 @@ timeout = 10.0
 
 [distance]
 kind = "virtual"
+renew = true
 side = {passing}/side"
 
 [link]

@@ -37,11 +37,13 @@ class Budget:
       trials: until eta is chosen (paper: 25).
       repeats: of the chosen eta afterwards, and of the fitted one (paper: 5).
       seed: of the virtual robot's physics and of the search.
+      horizon: the longest walk, s.
     """
 
     trials: int = StudySettings.trials
     repeats: int = StudySettings.repeats
     seed: int = 0
+    horizon: float = StudySettings.horizon
 
 
 def try_out(
@@ -76,6 +78,7 @@ def try_out(
         "initial": min(StudySettings.initial, budget.trials),
         "repeats": budget.repeats,
         "compare": [fitted.tolist()],
+        "horizon": budget.horizon,
         "lease": LEASE,
         "failures": 1,  # each is looked at by `_attend`
         "gate": "auto",
@@ -141,6 +144,8 @@ def _document(
 ) -> dict[str, Any]:
     kept = ("number", "purpose", "eta", "state", "attempt", "distance", "time", "reason")
     walks = [{name: t[name] for name in (*kept, "recording", "digest")} for t in study["trials"]]
+    for walk in walks:
+        walk["time"] = walk["time"] and round(walk["time"], 6)
     return {
         "schema": SCHEMA,
         "robot": study["robot"],

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -70,16 +70,23 @@ side = "{folder}/side"
 """For a busy machine: patient where a real robot's agent must not be."""
 
 
-def bundle(folder: Path, gait: Gait | None = None) -> Path:
+def bundle(
+    folder: Path,
+    gait: Gait | None = None,
+    parameters: Sequence[str] = ("a", "b", "c", "d"),
+    lively: bool = False,
+) -> Path:
     """Write a policy that follows its reference.
 
     Args:
       folder: for the bundle.
       gait: the reference; None for the robot's own, which steps in place and falls soon.
+      parameters: names of mu.
+      lively: whether it departs from the reference by what it sees and by eta.
     """
     gait = gait or DARWIN.gait
     assert gait is not None
-    shape = PolicyShape.of(Method.PUP, len(OBSERVATION), 4, len(DARWIN.joints))
+    shape = PolicyShape.of(Method.PUP, len(OBSERVATION), len(parameters), len(DARWIN.joints))
     rng = np.random.default_rng(0)
     weights: dict[str, np.ndarray] = {
         "observations.mean": np.zeros(len(OBSERVATION)),
@@ -90,10 +97,11 @@ def bundle(folder: Path, gait: Gait | None = None) -> Path:
         ("projection", (shape.parameters, *shape.projection, shape.latent)),
     ):
         for i, (inputs, outputs) in enumerate(pairwise(sizes)):
-            weights[f"{name}.{2 * i}.weight"] = 0.01 * rng.standard_normal((outputs, inputs))
+            spread = 0.2 if lively else 0.01
+            weights[f"{name}.{2 * i}.weight"] = spread * rng.standard_normal((outputs, inputs))
             weights[f"{name}.{2 * i}.bias"] = np.zeros(outputs)
     last = weights[f"actor.{2 * len(shape.hidden)}.bias"].reshape(shape.bins, shape.joints)
-    last[CENTRE] = 10.0
+    last[CENTRE] = 3.0 if lively else 10.0
     card = PolicyCard(
         robot=DARWIN.name,
         joints=DARWIN.joint_names,
@@ -103,9 +111,9 @@ def bundle(folder: Path, gait: Gait | None = None) -> Path:
         direction="forward",
         shape=shape,
         observation=OBSERVATION,
-        parameters=("a", "b", "c", "d"),
-        parameter_lower=(0.5,) * 4,
-        parameter_upper=(1.5,) * 4,
+        parameters=tuple(parameters),
+        parameter_lower=(0.5,) * len(parameters),
+        parameter_upper=(1.5,) * len(parameters),
         eta_lower=(-1.0,) * 3,
         eta_upper=(1.0,) * 3,
         rates=(25.0, 33.0),
