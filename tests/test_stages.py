@@ -1,0 +1,169 @@
+"""Stages of a job: done once, and again when what they depend on changed; left out, and why."""
+
+import json
+import shutil
+from pathlib import Path
+
+import agents
+import pytest
+from commandline import TINY, files, pup
+from refusals import Place, assert_refused
+from test_report import Page
+
+from pup.errors import InputError
+from pup.files import write_json
+from pup.robot import RobotDescription
+from pup.sysid.result import read_bounds
+from services.job_report import Job, found, write_report
+from services.pipeline import POLICIES
+from services.stages import Done, Journal, Stage
+
+DARWIN = RobotDescription.load("darwin_op2")
+
+
+class Counter:
+    """The work of a stage, which counts how often it is done."""
+
+    def __init__(self, out: Path) -> None:
+        self.out, self.count, self.fails = out, 0, False
+
+    def stage(self, value: str = "a", remade: bool = True) -> Stage:
+        return Stage(
+            "one", {"value": value}, ("one/x.json",), self.work, folder="one", remade=remade
+        )
+
+    def work(self) -> None:
+        self.count += 1
+        (self.out / "one").mkdir(exist_ok=True)
+        kept = [f.name for f in (self.out / "one").iterdir()]
+        (self.out / "one" / f"attempt{self.count}").touch()
+        if self.fails:
+            raise KeyboardInterrupt
+        write_json(self.out / "one" / "x.json", {"kept": sorted(kept)})
+
+
+def kept(out: Path) -> list[str]:
+    return list(json.loads((out / "one" / "x.json").read_text())["kept"])
+
+
+def test_a_stage_is_done_once_and_again_when_something_changed(tmp_path: Path) -> None:
+    counter = Counter(tmp_path)
+    for _ in range(2):
+        Journal(tmp_path).once(counter.stage())
+    assert counter.count == 1
+    done = Journal(tmp_path)
+    done.once(counter.stage())
+    assert done.done("one").inputs == {"value": "a"}
+    assert done.done("one").files.keys() == {"one/x.json"}
+    Journal(tmp_path).once(counter.stage("b"))
+    assert counter.count == 2 and kept(tmp_path) == []  # nothing of the other inputs is left
+    (tmp_path / "one" / "x.json").write_text("{}")
+    Journal(tmp_path).once(counter.stage("b"))
+    assert counter.count == 3 and kept(tmp_path) == []
+    (tmp_path / "one" / "x.json").unlink()
+    Journal(tmp_path).once(counter.stage("b", remade=False))
+    assert counter.count == 4 and kept(tmp_path) == ["attempt3"]
+
+
+def test_an_interrupted_stage_finds_what_it_left_unless_its_inputs_changed(tmp_path: Path) -> None:
+    counter = Counter(tmp_path)
+    counter.fails = True
+    for value, count in (("a", 1), ("a", 2), ("b", 3)):
+        with pytest.raises(KeyboardInterrupt):
+            Journal(tmp_path).once(counter.stage(value))
+        assert counter.count == count
+    counter.fails = False
+    Journal(tmp_path).once(counter.stage("b"))
+    assert kept(tmp_path) == ["attempt3"]
+
+
+def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"stages": []}')
+    with pytest.raises(InputError, match="not the journal"):
+        Journal(tmp_path)
+
+
+REFUSED = {
+    "--train-steps": ("servo_bench", ("--train-steps", 1000), "has no gait to train"),
+    "--trials": ("servo_bench", ("--trials", 3), "no policy to walk with"),
+    "trials without a policy": (
+        "darwin_op2",
+        ("--trials", 3, "--train-steps", 0),
+        "no policy to walk with",
+    ),
+    "too few": ("servo_bench", ("--trials", -1), "-1 is not between 0 and 1000"),
+    "half a step": ("servo_bench", ("--train-steps", 0.5), "'0.5' is not a whole number"),
+    "a walk of nobody": ("servo_bench", ("--repeats", "x"), "'x' is not a whole number"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_a_robot_cannot_do_is_refused_before_anything_is_done(
+    place: Place, name: str, tmp_path: Path
+) -> None:
+    robot, options, words = REFUSED[name]
+    folder = shutil.copytree(RobotDescription.load(robot).folder, tmp_path / "its" / robot)
+    shutil.rmtree(folder / POLICIES, ignore_errors=True)
+    given = () if robot == "darwin_op2" else ("--recordings", place.bench)
+    done = pup("run", "--robot", folder, *given, "--out", place.out, *TINY, *options)
+    assert_refused(done, words)
+    assert not files(place.out)
+
+
+def test_a_shipped_policy_is_started_from_where_the_bounds_are_of_its_parameters(
+    tmp_path: Path,
+) -> None:
+    from services.pipeline import Means, Mission, _Job
+    from services.presysid import Options
+
+    folder = shutil.copytree(DARWIN.folder, tmp_path / "darwin_op2")
+    shutil.rmtree(folder / POLICIES, ignore_errors=True)
+    names = read_bounds(DARWIN.identified_path, DARWIN).names
+    out = tmp_path / "out"
+    (out / "presysid").mkdir(parents=True)
+    shutil.copy(DARWIN.identified_path, out / "presysid" / "bounds.json")
+
+    def start() -> Path | None:
+        robot = RobotDescription.load(folder)
+        means = Means(None, None, None, None, print, 1)  # type: ignore[arg-type]
+        return _Job(robot, (), Mission(Options(), 1000, 0), out, means)._start()
+
+    assert start() is None
+    shipped = agents.bundle(folder / POLICIES / "forward", parameters=names)
+    assert start() == shipped
+    shutil.rmtree(shipped)
+    agents.bundle(shipped, parameters=names[1:])
+    assert start() is None
+
+
+def test_the_report_tells_what_each_stage_found_and_hashes(tmp_path: Path) -> None:
+    """Words of documents are text, never markup."""
+    walks = [
+        {"number": i + 1, "purpose": p, "eta": [0.1], "state": "succeeded", "attempt": 1}
+        | {"distance": 0.5 + 0.1 * i, "time": 3.0, "reason": "<b>fell</b>"}
+        for i, p in enumerate(("initial", "search", "repeat", "compare"))
+    ]
+    loss = {"loss": 1.0, "loss_before": 2.0, "rmse": 0.1, "rmse_before": 0.2}
+    parameter = {"name": "rho", "unit": "1", "nominal": 1, "lower": 0, "upper": 2}
+    documents = {
+        "presysid": {"parameters": [parameter | {"identified": True}], "loss": {"train": loss}},
+        "replay": {"per_recording": {"<i>a": 0.1}, "rmse": 0.1, "unit": "rad"},
+        "transfer": {
+            "horizon": 15.0,
+            "virtual_robot": 0,
+            "eta": [0.1],
+            "fitted_eta": [0.2],
+            "chosen": {"distance": [0.7, 0.9], "mean": 0.8, "std": 0.1414},
+            "fitted": {"distance": [], "mean": None, "std": None},
+            "walks": walks,
+        },
+    }
+    done = {n: Done({"robot r": "f" * 64}, 61.4, {f"{n}/x.json": "e" * 64}) for n in documents}
+    write_report(Job("r<obot", tmp_path, documents, done, {"train": "as told"}))
+    page = Page(tmp_path / "report.html")
+    assert "<b>fell" in page.text and "Job of r<obot" in page.text
+    assert not {"b", "i", "script"} & {name for name, _ in page.elements}
+    assert "left out: as told" in page.text
+    assert "e" * 64 in page.text and "f" * 64 in page.text
+    words = found(documents)["transfer"]
+    assert words == "2 trials; chosen eta 0.80 ± 0.14 m, eta of the fitted parameters not walked"
