@@ -246,6 +246,36 @@ def test_a_reset_leaves_the_servos_orders_alone() -> None:
         fleet.command(np.stack([START] * 2), 0.3)
 
 
+def test_after_a_reset_with_a_draw_nothing_of_the_past_is_left() -> None:
+    """The same draw gives the same motion and readings to the last bit, another one other noise."""
+
+    def seen(robot: VirtualRobot, past: float, draw: int) -> Array:
+        orders = robot.plant.drives.orders
+        orders.goal[:], orders.power[:], orders.kd[:] = ticks(START), 1.0, D_16
+        robot.plant.drives.refresh()
+        orders.goal[0, KNEE] += 300  # it falls
+        robot.advance(past)
+        orders.goal[:] = ticks(START)
+        robot.reset(draw=draw)
+        told = []
+        for _ in range(40):
+            robot.advance(1 / 33)
+            orders.goal[0, KNEE] += 10
+            turn, rate, force = robot.plant.imus.read(0)
+            told.append(
+                [*robot.plant.qpos[0], robot.plant.drives.volts[0, 0], *turn, *rate, *force]
+            )
+        return np.array(told)
+
+    robot = VirtualRobot(DARWIN, seed=3)
+    first, second = seen(robot, 0.517, 7), seen(robot, 1.2, 7)
+    assert np.array_equal(first, second)
+    assert np.array_equal(first, seen(VirtualRobot(DARWIN, seed=3), 0.1, 7))
+    other = seen(robot, 0.3, 8)
+    assert np.array_equal(first[:, :-10], other[:, :-10])
+    assert np.all(first[:, -10:] != other[:, -10:])
+
+
 def test_a_servo_whose_plug_was_pulled_comes_back_limp() -> None:
     robot = VirtualRobot(DARWIN, 1)
     robot.board.write(24, b"\x01")
