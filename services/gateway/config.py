@@ -64,8 +64,8 @@ class Config:
         if unknown := sorted(set(told) - names):
             known = ", ".join(sorted(names))
             raise InputError(f"{file}: {unknown[0]} is unknown; there are {known}")
-        if DATABASE_FILE in environment:
-            told["database"] = _held(Path(environment[DATABASE_FILE]))
+        if held := environment.get(DATABASE_FILE):
+            told["database"] = _held(Path(held))
         for name in names & {n.removeprefix(PREFIX).lower() for n in environment}:
             if PREFIX + name.upper() in environment:
                 told[name] = environment[PREFIX + name.upper()]
