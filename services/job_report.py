@@ -7,6 +7,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from matplotlib.ticker import MaxNLocator
+
 from pup.files import write_atomic
 from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, as_svg, drawing_style, new_figure
 from pup.sysid.html import Column, Drawing, Html, figure, page, table, tag
@@ -261,6 +263,7 @@ def trials_figure(told: Mapping[str, Any]) -> Drawing:
         chosen = [w for w in walked if w["purpose"] in purposes]
         x, y = [w["number"] for w in chosen], [w["distance"] for w in chosen]
         axes.plot(x, y, "o", markersize=4, color=colour, label=label)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("walk")
     axes.set_ylabel("distance, m")
     axes.grid(axis="y")
@@ -270,7 +273,8 @@ def trials_figure(told: Mapping[str, Any]) -> Drawing:
 
 def _picture(file: Path, alt: str, caption: str) -> Html:
     source = "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode()
-    return tag("figure", tag("img", src=source, alt=alt), tag("figcaption", caption))
+    image = tag("img", src=source, alt=alt, style="width: 100%")
+    return tag("figure", image, tag("figcaption", caption))
 
 
 def _artefacts(job: Job) -> Iterator[Html]:
