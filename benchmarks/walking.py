@@ -3,10 +3,11 @@
 Three things go through the same episodes of random actions, falls and resets among them: the whole
 task; its simulations alone, which are the engine with the torque law; and the engine alone, with
 the law's torques known beforehand. An env-step is a control step of one robot that is not a reset.
+Beside them the task of a corrected robot, with four effects, goes through the same actions.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,17 @@ from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import TaskSettings
 from pup.locomotion.simulations import Simulations
 from pup.locomotion.task import WalkingTask
-from pup.robot import RobotDescription
+from pup.robot import RobotDescription, TermSpec
 from pup.sysid.result import read_bounds
 
 SIZES = (64, 256, 1024)
+FOUND = (
+    TermSpec("backlash", "joint", "l_knee", {"gap": 0.006}),
+    TermSpec("stribeck_friction", "group", "ankle", {"torque": 0.05, "rest": 0.06, "speed": 0.5}),
+    TermSpec("command_delay", "bus", "", {"time": 0.012}),
+    TermSpec("voltage_sag", "bus", "", {"drop": 0.03}),
+)
+"""Effects of typical sizes."""
 
 
 def main() -> None:
@@ -34,7 +42,8 @@ def main() -> None:
             f"  {row['robots']:>4} robots: task {row['task']:,.0f} on the clock, "
             f"{row['task_per_core']:,.0f} per core; engine {row['engine_per_core']:,.0f} per core; "
             f"engine and law over task {_told(row['law_share'])}, engine over task "
-            f"{_told(row['engine_share'])}"
+            f"{_told(row['engine_share'])}; task with {len(FOUND)} effects over task, an env-step, "
+            f"{_told(row['effects_share'])}"
         )
     report.add("rows", rows)
     report.finish()
@@ -45,18 +54,28 @@ def _row(n: int, threads: int, steps: int, rounds: int) -> dict[str, Any]:
     sampler = ParameterSampler(read_bounds(robot.identified_path, robot))
     settings = TaskSettings()
     actions = np.random.default_rng(1).integers(0, settings.bins, (steps, n, len(robot.joints)))
-    live = 0
+    live = live_corrected = 0
 
     def task() -> WalkingTask:
         return WalkingTask(robot, sampler, settings, n, np.random.default_rng(0), threads)
 
     whole = task()
+    corrected = WalkingTask(
+        replace(robot, terms=FOUND),
+        ParameterSampler(read_bounds(robot.identified_path, replace(robot, terms=FOUND))),
+        settings,
+        n,
+        np.random.default_rng(0),
+        threads,
+    )
 
     def walk() -> None:
         nonlocal live
-        whole.rng = np.random.default_rng(0)
-        whole.reset()
-        live = sum(int(whole.step(action).live.sum()) for action in actions)
+        live = _walked(whole, actions)
+
+    def walk_corrected() -> None:
+        nonlocal live_corrected
+        live_corrected = _walked(corrected, actions)
 
     calls = _calls(task(), actions)
     physics, engine = (task()._simulations for _ in range(2))
@@ -69,7 +88,7 @@ def _row(n: int, threads: int, steps: int, rounds: int) -> dict[str, Any]:
         known()
         _go_through(engine, calls)
 
-    costs = in_turn([walk, with_law, alone], rounds)
+    costs = in_turn([walk, with_law, alone, walk_corrected], rounds)
     clock = [float(np.median([c.wall for c in of])) for of in costs]
     busy = [[c.processor for c in of] for of in costs]
     return {
@@ -80,7 +99,17 @@ def _row(n: int, threads: int, steps: int, rounds: int) -> dict[str, Any]:
         "engine_per_core": live / float(np.median(busy[2])),
         "law_share": asdict(ratio(busy[1], busy[0])),
         "engine_share": asdict(ratio(busy[2], busy[0])),
+        "effects_share": asdict(
+            ratio([s / live_corrected for s in busy[3]], [s / live for s in busy[0]])
+        ),
     }
+
+
+def _walked(task: WalkingTask, actions: np.ndarray) -> int:
+    """Control steps of a task through actions from a first reset on, less those that reset."""
+    task.rng = np.random.default_rng(0)
+    task.reset()
+    return sum(int(task.step(action).live.sum()) for action in actions)
 
 
 Call = tuple[str, tuple[Any, ...]]
