@@ -232,6 +232,7 @@ class _Job:
             "start": self.origin,
             "steps": steps,
             "seconds": round(self.seconds, 1),
+            "terms": [asdict(term) for term in self.robot.terms],
             "engine": engine(),
             "written": now(),
         }
@@ -352,6 +353,7 @@ class _Job:
                 "bounds": str(self.source),
                 "bounds_sha256": self.bounds_sha256,
                 "robot_digest": self.robot.digest,
+                "terms": [asdict(term) for term in self.robot.terms],
                 "engine": engine(),
             },
         }

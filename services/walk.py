@@ -78,7 +78,9 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     document = {
         "schema": 1,
         "robot": robot.name,
+        "robot_digest": robot.digest,
         "policy": str(shown.policy),
+        "trained_on": policy.card.robot_digest,
         "method": policy.card.method,
         "direction": policy.card.direction,
         "eta": None if eta is None else eta.tolist(),
