@@ -11,6 +11,7 @@ import agents
 import fake_agent
 import gateways
 import numpy as np
+import psutil
 import pytest
 from commandline import pup
 
@@ -73,8 +74,10 @@ def test_it_outlives_the_gateway_and_is_resumed(robot, service, tmp_path):
     first = subprocess.Popen(run, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
     while not agent.journal.walked:
         time.sleep(0.05)
+    fits = psutil.Process(service.process.pid).children(recursive=True)
     service.kill(signal.SIGKILL)
-    time.sleep(1.0)
+    _, left = psutil.wait_procs(fits, timeout=20)
+    assert fits and not left, "its processes follow a gateway that was killed"
     service.start()
     time.sleep(1.0)
     first.send_signal(signal.SIGINT)
