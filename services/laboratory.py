@@ -37,8 +37,6 @@ GRACE = 15.0
 """For a process to end by itself, s."""
 RESTARTS = 3
 """Of each process, before the laboratory is given up."""
-COOLING = 2.0
-"""Of the robot's time that passes between two looks at motors that are too warm, s."""
 
 CONFIG = """schema = 1
 name = {agent}
@@ -154,7 +152,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
         if health["state"] in ("disabled", "stopped", "fault"):
             self._agent("enable")
         elif health["waiting"] == "cool":
-            self._hand(cmd="wait", time=COOLING)
+            self._hand(cmd="reset", draw=0)  # each walk begins with cold motors anyway
 
     def _open(self) -> None:
         shutil.rmtree(self.keys, ignore_errors=True)

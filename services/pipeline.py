@@ -26,6 +26,8 @@ DIRECTION = "forward"
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
 STEPS = 800_000
 """Of the training unless told otherwise: three minutes at 4,500 a second."""
+TRIALS = 25
+"""Walks until eta is chosen (paper)."""
 FURTHER_RATE = 2e-4
 """Adam's, where a policy that walks is trained further: the usual one would undo its gait."""
 EPISODES = 50
@@ -38,8 +40,8 @@ class Mission:
     Attributes:
       presysid: budget of its fits.
       steps: of the training; 0 leaves it out; None for STEPS where the robot has a gait.
-      trials: walks until eta is chosen; 0 leaves them out; None for the paper's 25 where the robot
-        has a gait and servos.
+      trials: walks until eta is chosen; 0 leaves them out; None for TRIALS where the robot has a
+        gait and servos.
       repeats: walks of the chosen eta and of the fitted one.
     """
 
@@ -110,7 +112,7 @@ class _Job:
         self.shipped = robot.folder / POLICIES / DIRECTION
         self.left_out: dict[str, str] = {}
         self.steps = self._wanted("train", mission.steps, STEPS, self._no_training())
-        self.trials = self._wanted("transfer", mission.trials, 25, self._no_trials())
+        self.trials = self._wanted("transfer", mission.trials, TRIALS, self._no_trials())
         self.journal = Journal(out)
 
     def run(self) -> dict[str, Any]:
