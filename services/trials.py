@@ -80,7 +80,7 @@ def try_out(
         "compare": [fitted.tolist()],
         "horizon": budget.horizon,
         "lease": LEASE,
-        "failures": 1,  # each is looked at by `_attend`
+        "failures": 1,  # each is looked at by `attend`
         "gate": "auto",
         "agent": AGENT,
         "seed": budget.seed,
@@ -93,7 +93,7 @@ def try_out(
 
         def tend(gateway: Gateway, study: dict[str, Any]) -> None:
             laboratory.tend()
-            _attend(gateway, study)
+            attend(gateway, study)
 
         wanted = Wanted(policy, STUDY, laboratory.url, laboratory.token, settings)
         study = transfer(wanted, out, tell, tend)
@@ -116,7 +116,7 @@ def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]
     return policy.project((mu - lower) / np.where(upper > lower, upper - lower, 1.0))
 
 
-def _attend(gateway: Gateway, study: dict[str, Any]) -> None:
+def attend(gateway: Gateway, study: dict[str, Any]) -> None:
     """What an operator decides on a study that pauses: once more, or without that trial.
 
     A walk that the end of a process cut off is walked again under the same number, so that the

@@ -179,9 +179,10 @@ def test_killed_at_every_stage_it_ends_as_if_nothing_had_happened(
     pytest.importorskip("torch")
     pytest.importorskip("gymnasium")
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    options = (*command, *FEW, "--train-steps", 200_000)
+    options = (*command, *FEW, "--train-steps", 20_000)
     assert Job(*options, out=whole).end()[0] == 0
-    for moment in ("presysid/checkpoints/*.npz", "train/checkpoint.npz", "walk/gait.png"):
+    moments = "presysid/checkpoints/*.npz", "ray", "train/checkpoint.npz", "walk/gait.png"
+    for moment in moments:
         job = Job(*options, out=parts)
         job.come_to(moment)
         job.process.kill()

@@ -15,10 +15,15 @@ import psutil
 import pytest
 from commandline import pup
 
+from pup.errors import InputError
 from pup.policy.bundle import read_bundle
+from pup.wire import Finished, Outcome
 
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
+
+from services import transfer
+from services.trials import attend
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +110,35 @@ def test_simulated_rollouts_go_with_the_study(robot, tmp_path):
     why = [e["detail"].get("why") for e in done.json()["history"] if e["kind"] == "requested"]
     assert why[0] == "best in simulation"
     assert np.abs(done.json()["trials"][0]["eta"]).max() < 0.5
+
+
+def test_attended_a_study_goes_on_without_results_but_not_for_ever(
+    robot, service, tmp_path, monkeypatch
+):
+    """A trial without one is attempted again, then another takes its place."""
+    agent, _ = robot
+    monkeypatch.setattr(transfer, "PERIOD", 0.05)
+    good, cut_off = agent.walk, {(2, 1), (3, 1), (3, 2), (3, 3)}
+
+    def walk(body):
+        number = int(body.trial.rpartition("/")[2])
+        if cut_off and (number, body.attempt) not in cut_off:
+            return good(body)
+        return Finished(body.trial, body.attempt, body.fence, Outcome.ABORTED, reason="cut off")
+
+    def study(name):
+        settings = {"trials": 3, "initial": 3, "repeats": 0, "failures": 1, "gate": "auto"}
+        settings["agent"] = agent.name
+        token = service.tokens["operator"]
+        wanted = transfer.Wanted(tmp_path / "policy", name, service.url, token, settings)
+        return transfer.transfer(wanted, tmp_path, lambda line: None, attend)
+
+    agent.walk = walk
+    told = [(t["state"], t["attempt"]) for t in study(f"{agent.name}-a")["trials"]]
+    assert told == [("succeeded", 1), ("succeeded", 2), ("aborted", 3), ("succeeded", 1)]
+    cut_off.clear()
+    with pytest.raises(InputError, match="no results: cut off"):
+        study(f"{agent.name}-b")
 
 
 def test_tokens_and_keys_by_command(tmp_path, monkeypatch):
