@@ -155,7 +155,7 @@ def _stages(job: Job) -> Iterator[Html]:
     words = found(job.documents)
     rows = [(TITLES[n], f"{job.done[n].seconds:,.0f}", words[n]) for n in job.documents]
     rows += [(TITLES[name], "", f"left out: {why}") for name, why in job.left_out.items()]
-    columns = [Column("Stage", "words"), Column("Took [s]", "number"), Column("Found", "long")]
+    columns = [Column("Stage"), Column("Took [s]", "number"), Column("Found", "long")]
     yield table("Stages, with the time since each was last interrupted", columns, rows)
 
 
