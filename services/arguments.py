@@ -21,12 +21,12 @@ from services.options import (
 
 DEFAULT_ROBOT = "darwin_op2"
 TRAINING = (
-    ("--steps", (1000, 10**11), int, 12_000_000, "control steps of all simulations together"),
-    ("--simulations", (1, 65536), int, 512, "at once, of each process that simulates"),
-    ("--length", (2, 4096), int, 32, "control steps of each simulation between two updates"),
-    ("--epochs", (1, 100), int, 5, "passes over the samples of an update"),
-    ("--minibatch", (16, 2**20), int, 4096, "samples of a gradient step"),
-    ("--learning-rate", (1e-7, 1.0), float, 5e-4, "at the beginning"),
+    ("--steps", (1000, 10**11), int, 10_000_000, "control steps of all simulations together"),
+    ("--simulations", (1, 65536), int, 256, "at once, of each process that simulates"),
+    ("--length", (2, 4096), int, 24, "control steps of each simulation between two updates"),
+    ("--epochs", (1, 100), int, 4, "passes over the samples of an update"),
+    ("--minibatch", (16, 2**20), int, 1536, "samples of a gradient step"),
+    ("--learning-rate", (1e-7, 1.0), float, 1e-3, "at the beginning"),
     ("--entropy", (0.0, 10.0), float, 0.0, "weight of exploration, falling to 0"),
     ("--mirror", (0.0, 1000.0), float, 1.0, "weight of left-right symmetry; never sideways"),
 )

@@ -67,10 +67,10 @@ class Options:
 
     method: Method = Method.PUP
     direction: Direction = Direction.FORWARD
-    steps: int = 12_000_000
+    steps: int = 10_000_000
     seed: int = 0
-    simulations: int = 512
-    length: int = 32
+    simulations: int = 256
+    length: int = 24
     learning: Learning = field(default_factory=Learning)
     runners: int = 0
     start: Path | None = None
