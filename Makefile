@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 OUT ?= out
 ROBOT ?= darwin_op2
 
-.PHONY: run test slow lint clean
+.PHONY: run test slow lint docs clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -33,5 +33,8 @@ test: lint
 slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow
 
+docs: $(VENV)/.installed
+	$(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) out build site *.egg-info
