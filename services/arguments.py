@@ -268,6 +268,13 @@ def _replay(verb: argparse.ArgumentParser) -> None:
         metavar="N",
         help="with parameters drawn from the bounds, for the numbers; default: %(default)s",
     )
+    walk.add_argument(
+        "--landscape",
+        type=number(0, 4096),
+        default=0,
+        metavar="N",
+        help="walk N etas on 16 draws of the parameters, for pup transfer --simulated",
+    )
     seed(walk)
 
 

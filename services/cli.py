@@ -165,7 +165,14 @@ def _walk(options: argparse.Namespace) -> dict[str, Any]:
     from services.walk import Shown, walk
 
     robot = RobotDescription.load(options.robot)
-    shown = Shown(options.policy, options.bounds, options.eta, options.episodes, options.seed)
+    shown = Shown(
+        options.policy,
+        options.bounds,
+        options.eta,
+        options.episodes,
+        options.landscape,
+        options.seed,
+    )
     with _folder(options.out) as out:
         return walk(robot, shown, out, places.cores(options))
 

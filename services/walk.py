@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import qmc
 
 from pup.errors import InputError
 from pup.files import write_json
 from pup.locomotion.evaluation import evaluate
+from pup.locomotion.landscape import landscape
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.locomotion.task import WalkingTask
@@ -19,6 +21,8 @@ from pup.sysid.result import FittedBounds, read_bounds
 from services.footage import Footage, draw_gait, film
 
 Array = NDArray[np.float64]
+DRAWS = 16
+"""Of the parameters, for a landscape."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,8 @@ class Shown:
       bounds: file it was trained on; None for the robot's `identified.json`.
       eta: what the policy is conditioned on; None projects the true parameters.
       episodes: with parameters drawn anew, for the numbers.
+      landscape: etas that are walked with 16 draws of the parameters, for `pup transfer
+        --simulated`; 0 for none.
       seed: of everything random.
     """
 
@@ -37,11 +43,12 @@ class Shown:
     bounds: Path | None = None
     eta: tuple[float, ...] | None = None
     episodes: int = 50
+    landscape: int = 0
     seed: int = 0
 
 
 def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict[str, Any]:
-    """Let a policy walk; write `replay.json`, `gait.png` and a video.
+    """Let a policy walk; write `replay.json`, `gait.png`, a video and, if asked, `simulated.json`.
 
     One episode with the fitted parameters is shown. Others, with parameters drawn from the bounds,
     tell how far the policy gets.
@@ -74,6 +81,8 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     footage = Footage.of(task(ParameterSampler.nominal(bounds), 1), act)
     walks = evaluate(act, task(ParameterSampler(bounds), shown.episodes))
     draw_gait(out / "gait.png", robot, footage)
+    if shown.landscape:
+        _write_landscape(out / "simulated.json", robot, policy, bounds, settings, shown, threads)
     video, drawn = film(out / "walk", robot, footage)
     document = {
         "schema": 1,
@@ -98,6 +107,25 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     }
     write_json(out / "replay.json", document)
     return document
+
+
+def _write_landscape(
+    file: Path,
+    robot: RobotDescription,
+    policy: NumpyPolicy,
+    bounds: FittedBounds,
+    settings: TaskSettings,
+    shown: Shown,
+    threads: int,
+) -> None:
+    """Distances over eta's box, where the projections of the bounds are; see docs/transfer.md."""
+    card = policy.card
+    if not card.shape.eta:
+        raise InputError(f"{shown.policy}: is conditioned on nothing; leave --landscape out")
+    points = qmc.Sobol(card.shape.eta, seed=shown.seed).random(shown.landscape)
+    eta = qmc.scale(points, card.eta_lower, card.eta_upper)
+    distance = landscape(policy.act, robot, bounds, settings, eta, DRAWS, shown.seed, threads)
+    write_json(file, {"schema": 1, "eta": eta.tolist(), "distance": distance.tolist()})
 
 
 def _eta(policy: NumpyPolicy, told: tuple[float, ...]) -> Array:

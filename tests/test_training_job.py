@@ -4,9 +4,12 @@ import os
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commandline import pup
 from jobs import Job
+
+from services.transfer import read_simulated
 
 pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
@@ -32,12 +35,14 @@ def test_a_stopped_training_says_so_and_leaves_nothing_running(tmp_path: Path) -
     job.assert_nothing_left()
     policy = tmp_path / "short" / "policy"
     walk = ("replay", "--policy", policy, "--robot", "darwin_op2", "--episodes", 4, "--json")
-    shown = pup(*walk, "--out", tmp_path / "walk").json()
+    shown = pup(*walk, "--landscape", 2, "--out", tmp_path / "walk").json()
     assert len(shown["distance"]) == len(shown["fell"]) == 4
     assert shown["shown"]["time"] > 0
     assert (tmp_path / "walk" / "gait.png").read_bytes().startswith(b"\x89PNG")
     assert Path(shown["video"]).stat().st_size > 1000
     assert shown["drawn_by"] in ("mujoco", "matplotlib")
+    simulated = read_simulated(tmp_path / "walk" / "simulated.json")
+    assert np.shape(simulated["eta"]) == (2, 3) and np.shape(simulated["distance"]) == (16, 2)
     assert pup(*walk, "--out", tmp_path / "other", "--eta", "0,0").code == 2
     leg = ("replay", "--policy", policy, "--robot", "darwin_leg", "--out", tmp_path / "other")
     refused = pup(*leg)
