@@ -1,6 +1,6 @@
 """What custom resources may hold, as far as we write them.
 
-Facts of KubeRay 1.7.0 (`ray-operator/config/crd/bases`) and of the Prometheus operator 0.80
+Facts of KubeRay 1.7.0 (`ray-operator/config/crd/bases`) and of the Prometheus operator
 (`ServiceMonitor`, `PodMonitor`): names of fields and their types. Pod templates and the like are
 those of Kubernetes itself. A field that is not here is a mistake, or is to be added. With KubeRay's
 own definitions at hand, test_deploy.py holds this against them.

@@ -172,12 +172,8 @@ def test_volumes_claims_and_services_are_there(name: str) -> None:
     for pod in pods(documents(name)):
         volumes = {v["name"] for v in pod.spec["volumes"]}
         assert {m["name"] for c in pod.containers for m in c["volumeMounts"]} <= volumes
-        used = [
-            v["persistentVolumeClaim"]
-            for v in pod.spec["volumes"]
-            if len(v) > 1 and "persistentVolumeClaim" in v
-        ]
-        assert {claim["claimName"] for claim in used} <= claims
+        used = [v.get("persistentVolumeClaim", {}) for v in pod.spec["volumes"]]
+        assert {claim["claimName"] for claim in used if claim} <= claims
     for service in (d for d in overlay(name) if d["kind"] == "Service"):
         led = [
             p
@@ -256,9 +252,14 @@ def test_every_secret_is_made_and_has_what_is_read(name: str, secrets: list[Docu
     made = {d["metadata"]["name"]: set(d["data"]) for d in secrets}
     used: dict[str, set[str]] = {}
     for pod in pods(documents(name)):
-        for volume in pod.spec["volumes"]:
-            if "secret" in volume:
-                used.setdefault(volume["secret"]["secretName"], set())
+        secret = {
+            v["name"]: v["secret"]["secretName"] for v in pod.spec["volumes"] if "secret" in v
+        }
+        for container in pod.containers:
+            for mount in container["volumeMounts"]:
+                if mount["name"] in secret:
+                    keys = used.setdefault(secret[mount["name"]], set())
+                    keys |= read_below(mount["mountPath"], container["env"])
     for document in documents(name):
         spec = document.get("spec", {})
         if document["kind"] in ("RayCluster", "RayJob"):
@@ -267,13 +268,19 @@ def test_every_secret_is_made_and_has_what_is_read(name: str, secrets: list[Docu
         if document["kind"] == "ServiceMonitor":
             told = spec["endpoints"][0]["authorization"]["credentials"]
             used.setdefault(told["name"], set()).add(told["key"])
-    used["pup-tokens"].add("tokens.json")
-    used["pup-curve"] |= {"gateway.key", "gateway.key_secret"}
+    assert used["pup-tokens"] == {"tokens.json"}
+    used["pup-curve"] |= {"gateway.key", "gateway.key_secret"}  # of a KeyRing's folder
     assert set(used) <= set(made)
     for secret, keys in used.items():
         assert keys <= made[secret], secret
     if name != "dev":
         assert set(used) == set(made)
+
+
+def read_below(folder: str, environment: list[Document]) -> set[str]:
+    """Files of a folder that variables name."""
+    named = [Path(e["value"]) for e in environment if e["value"].startswith(f"{folder}/")]
+    return {str(file.relative_to(folder)) for file in named}
 
 
 def test_no_secret_is_in_the_repository() -> None:
