@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from test_simulator import recording
 from test_terms import a_term
-from walking import DARWIN, EXACT, JOINTS, QPOS, idle, random_actions, walking
+from walking import DARWIN, EXACT, JOINTS, QPOS, QVEL, idle, random_actions, walking
 
 from pup.errors import InputError
 from pup.locomotion.sampling import ParameterSampler
@@ -216,7 +216,7 @@ def test_a_task_of_all_effects_resumes_bit_by_bit_on_any_number_of_threads() -> 
             np.testing.assert_array_equal(values, whole.state()[name], err_msg=name)
 
 
-def test_an_effect_s_state_is_in_the_tasks_state() -> None:
+def test_the_state_of_every_kind_of_effect_is_in_the_tasks_state() -> None:
     task = task_with(EVERYTHING, n=2)
     task.reset()
     before = task.state()
@@ -327,7 +327,36 @@ def test_bounds_of_a_term_are_drawn_for_each_episode() -> None:
         task.step(idle(6))
 
 
-def test_a_term_that_cannot_act_is_refused_in_one_line() -> None:
-    with pytest.raises(InputError, match="structural_flex cannot act") as refused:
-        task_with(corrected(TermSpec("structural_flex", "body", "body", {"compliance": 0.01})))
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (
+            TermSpec("structural_flex", "body", "body", {"compliance": 0.01}),
+            "place body:body: no joint carries it, so structural_flex cannot act",
+        ),
+        (TermSpec("clock_skew", "robot", "", {"share": -1.0}), "clock_skew: a clock at 0 of its"),
+    ],
+)
+def test_a_term_that_cannot_act_is_refused_in_one_line(term: TermSpec, words: str) -> None:
+    with pytest.raises(InputError, match=words) as refused:
+        task_with(corrected(term))
     assert "\n" not in str(refused.value)
+
+
+def test_a_simulation_that_breaks_down_spoils_no_other() -> None:
+    """Nor itself, once it has started anew."""
+    sound, broken = (task_with(EVERYTHING, n=4) for _ in range(2))
+    sound.reset(), broken.reset()
+    sound.step(idle(4)), broken.step(idle(4))
+    state = broken.state()
+    state["simulations/physics"][1, QVEL] = 1e9
+    state["simulations/physics"][2, QPOS.start + 9] = np.nan
+    broken.restore(state)
+    for i in range(4):
+        step, other = broken.step(idle(4)), sound.step(idle(4))
+        assert np.isfinite(step.observation.proprioception).all()
+        assert np.isfinite(step.reward).all() and np.isfinite(step.distance).all()
+        np.testing.assert_array_equal(step.terminated, [False, i == 0, i == 0, False])
+        np.testing.assert_array_equal(step.reward[[0, 3]], other.reward[[0, 3]])
+    for name, values in broken.state().items():
+        assert not np.isnan(values.astype(float)).any(), name

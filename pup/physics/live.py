@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.errors import InputError
 from pup.physics.actuators import TorqueLaw
 from pup.physics.commands import LiveCommands
 from pup.physics.encoders import History
@@ -33,10 +34,20 @@ def has_terms(space: ParameterSpace) -> bool:
 
 
 def paced(terms: Sequence[Term], scene: Scene) -> None:
-    """Shorten the sub-steps, in place, where the clock that commands come by goes fast."""
+    """Shorten the sub-steps, in place, where the clock that commands come by goes fast.
+
+    Raises:
+      InputError: a clock stands still or goes backwards.
+    """
     for term in terms:
         if term.answers("pace"):
-            np.asarray(scene.timestep)[:] /= term.pace()
+            pace = term.pace()
+            if not (pace > 0).all():
+                raise InputError(
+                    f"{term.effect}: a clock at {pace.min():g} of its speed never tells a next "
+                    "command; correct its share"
+                )
+            np.asarray(scene.timestep)[:] /= pace
 
 
 class LiveServos:

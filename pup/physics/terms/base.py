@@ -217,9 +217,10 @@ class Term:
         raise NotImplementedError
 
     def pace(self) -> Array:
-        """How fast the clock of commands goes, (n_simulations, 1); what `lateness` comes of.
+        """How fast the clock goes that commands come by, (n_simulations, 1); 1 for right.
 
-        Who sends commands as time goes by sends them faster.
+        A term that has it is late by nothing else: where commands are told as time goes by, its
+        `lateness` is left out and the time between two of them is divided by this.
         """
         raise NotImplementedError
 
