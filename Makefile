@@ -15,6 +15,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
 	touch $@
 
+# Tests need the engine on JAX too.
+$(VENV)/.tested: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[brax]'
+	touch $@
+
 IMPORTED := $(if $(FORMAT),$(OUT)/recordings,$(RECORDINGS))
 
 run: $(VENV)/.installed
@@ -27,10 +32,10 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: lint
+test: lint $(VENV)/.tested
 	$(BIN)/python -m pytest
 
-slow: $(VENV)/.installed
+slow: $(VENV)/.tested
 	$(BIN)/python -m pytest -m slow
 
 docs: $(VENV)/.installed

@@ -43,7 +43,7 @@ _BROKEN = [
 
 
 @dataclass(frozen=True)
-class _Group:
+class Group:
     """Recordings of one support, longest first, so that those still running are the first ones.
 
     Attributes:
@@ -122,10 +122,10 @@ class MujocoSimulator:
         )
         jobs = [(group, part) for group in self.groups for part in self._parts(group, n)]
 
-        def run(job: tuple[_Group, slice]) -> None:
+        def run(job: tuple[Group, slice]) -> None:
             group, part = job
             pushed = None if push is None else push.of(part, group.members)
-            _Run(self.robot, group, candidates.rows(part), self.law, pushed).into(out, part)
+            self._run(group, candidates.rows(part), pushed).into(out, part)
 
         if self.threads == 1:
             for job in jobs:
@@ -135,7 +135,10 @@ class MujocoSimulator:
                 list(pool.map(run, jobs))
         return out
 
-    def _parts(self, group: _Group, candidates: int) -> list[slice]:
+    def _run(self, group: Group, candidates: Candidates, push: Push | None) -> "Run":
+        return Run(self.robot, group, candidates, self.law, push)
+
+    def _parts(self, group: Group, candidates: int) -> list[slice]:
         """The candidates in parts of one batch each, equally many parts for every thread."""
         most = max(1, SIMULATIONS // len(group.setups))
         each = -(-candidates // (most * self.threads))
@@ -143,7 +146,7 @@ class MujocoSimulator:
         edges = np.linspace(0, candidates, parts + 1).astype(int)
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
-    def _group(self, support: str) -> _Group:
+    def _group(self, support: str) -> Group:
         members = [i for i, r in enumerate(self.recordings) if r.support == support]
         model = compile_model(self.robot, support)
         plans = {
@@ -159,7 +162,7 @@ class MujocoSimulator:
             standing_qpos(self.robot, model, plans[i].start, tilt)
             for i, tilt in zip(members, torso, strict=True)
         ]
-        return _Group(
+        return Group(
             members=tuple(members),
             model=model,
             setups=tuple(self.robot.setup(self.recordings[i].setup) for i in members),
@@ -195,13 +198,13 @@ def _events(
     )
 
 
-class _Run:
+class Run:
     """One batch: the simulations stand recording by recording, candidate by candidate."""
 
     def __init__(
         self,
         robot: RobotDescription,
-        group: _Group,
+        group: Group,
         candidates: Candidates,
         law: Callable[[RobotDescription, Candidates], TorqueLaw],
         push: Push | None = None,
@@ -318,14 +321,18 @@ class _Run:
             if observed is not None:
                 self._store(observed, out, part)
             n = int(running) * self.candidates
-            self._drive(step, n, (sensed[0][:n], sensed[1][:n]))
-            self._advance(None if n == len(self.ids) else self.ids[:n])
+            self._substep(step, n, (sensed[0][:n], sensed[1][:n]))
             observed = event
             if event is not None and self.group.model.floating:
                 self._store_feet(event, out, part)
         self._sensed(n)
         if observed is not None:
             self._store(observed, out, part)
+
+    def _substep(self, step: int, n: int, sensed: tuple[Array, Array]) -> None:
+        """Move the first simulations on by one sub-step."""
+        self._drive(step, n, sensed)
+        self._advance(None if n == len(self.ids) else self.ids[:n])
 
     def _sensed(self, n: int) -> tuple[Array, Array]:
         """What the first simulations' encoders tell at a sub-step, kept for the ticks around it."""
