@@ -9,6 +9,7 @@ from services.options import (
     budget,
     cores,
     count,
+    engine,
     knob,
     number,
     numbers,
@@ -154,6 +155,7 @@ def _train(verb: argparse.ArgumentParser) -> None:
         metavar="N",
         help="processes that simulate, lost ones are replaced; default: none beside the learner's",
     )
+    engine(where)
     cores(where)
 
 
@@ -252,6 +254,7 @@ def _replay(verb: argparse.ArgumentParser) -> None:
         "default: the robot's own identified.json, without one the values of its robot.toml",
     )
     out(verb, "replay.json and a plot per recording, or of the walk and a video")
+    engine(verb)
     cores(verb)
     walk = verb.add_argument_group("a policy instead of recordings")
     walk.add_argument("--policy", type=Path, metavar="DIR", help="policy of `pup train`")

@@ -150,15 +150,19 @@ def _service() -> None:
 def _replay(options: argparse.Namespace) -> dict[str, Any]:
     if bool(options.recordings) == bool(options.policy):
         raise InputError("give either recordings or --policy DIR")
+    if options.policy and options.engine != "mujoco":
+        raise InputError(f"--engine {options.engine} replays recordings; a policy walks in mujoco")
     if options.policy:
         return _walk(options)
+    from pup.physics.engine import Engine
     from pup.recording import load_recordings
     from services.replay import replay
 
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
     with _folder(options.out) as out:
-        return replay(robot, recordings, options.bounds, out, places.cores(options))
+        cores, engine = places.cores(options), Engine(options.engine)
+        return replay(robot, recordings, options.bounds, out, cores, engine)
 
 
 def _walk(options: argparse.Namespace) -> dict[str, Any]:

@@ -46,6 +46,17 @@ def actuator(to: Any) -> None:
     )
 
 
+def engine(to: Any) -> None:
+    """What simulates."""
+    to.add_argument(
+        "--engine",
+        choices=("mujoco", "brax"),
+        default="mujoco",
+        help="what simulates; brax is JAX with Brax's MJX pipeline, for accelerators, and needs "
+        "the extra `brax`; default: %(default)s",
+    )
+
+
 def seed(to: Any, more: str = "") -> None:
     """What is drawn."""
     to.add_argument(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pup.files import write_json
-from pup.physics.mujoco_batch import MujocoSimulator
+from pup.physics.engine import Engine, make_simulator
 from pup.physics.parameters import ParameterSpace, robot_space
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
@@ -38,6 +38,7 @@ def replay(
     bounds: Path | None,
     out: Path,
     threads: int,
+    engine: Engine = Engine.MUJOCO,
 ) -> dict[str, Any]:
     """Replay recordings and write `replay.json` and overlay plots.
 
@@ -47,12 +48,13 @@ def replay(
       bounds: see `model_of`.
       out: folder for the files.
       threads: cores to use.
+      engine: what simulates.
 
     Returns:
       The document of `replay.json`; errors in its `unit`.
     """
     actuator, space, source = model_of(robot, bounds)
-    simulator = MujocoSimulator(robot, recordings, actuator, threads)
+    simulator = make_simulator(engine, robot, recordings, actuator, threads)
     trajectories = simulator.replay(space.candidates())
     loss = ReplayLoss(robot, recordings)
     errors = loss.rmse(trajectories)[0]
@@ -60,6 +62,7 @@ def replay(
         "schema": 1,
         "robot": robot.name,
         "actuator": actuator,
+        "engine": engine,
         "model": source,
         "unit": JointUnits.of(robot, recordings).position,
         "rmse": _rms(errors),

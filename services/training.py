@@ -19,6 +19,7 @@ from pup.files import write_json
 from pup.locomotion.sampling import MARGIN
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.locomotion.task import WalkingTask
+from pup.physics.engine import Engine
 from pup.policy.bundle import CARD, NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
 from pup.policy.losses import LossWeights
 from pup.policy.mirror import MirrorMap
@@ -63,6 +64,7 @@ class Options:
       start: bundle whose weights are trained further, perhaps of other bounds of the same
         parameters; None draws weights.
       track: other places that are told the curve, `wandb` and `mlflow`.
+      engine: what simulates.
     """
 
     method: Method = Method.PUP
@@ -75,6 +77,7 @@ class Options:
     runners: int = 0
     start: Path | None = None
     track: tuple[str, ...] = ()
+    engine: Engine = Engine.MUJOCO
 
 
 def train(
@@ -126,6 +129,7 @@ def training_options(given: argparse.Namespace) -> Options:
         runners=given.runners,
         start=given.start,
         track=tuple(given.track),
+        engine=Engine(given.engine),
     )
 
 
@@ -148,7 +152,7 @@ class _Job:
         self.bounds_sha256 = hashlib.sha256(self.source.read_bytes()).hexdigest()
         self.settings = TaskSettings(direction=options.direction)
         nominal = options.method == Method.NOMINAL
-        self.walking = Walking(robot, self.bounds, self.settings, nominal)
+        self.walking = Walking(robot, self.bounds, self.settings, nominal, options.engine)
         task = self.walking(1, 0, 1)
         self.shape = PolicyShape.of(
             options.method,
@@ -323,6 +327,8 @@ class _Job:
         """Of all that the weights depend on."""
         told = self._told_options()
         del told["track"], told["start"]
+        if self.options.engine is Engine.MUJOCO:
+            del told["engine"]  # as before there were two
         first = hashlib.sha256()
         for name, value in (self.first or {}).items():
             first.update(name.encode() + value.tobytes())

@@ -7,6 +7,7 @@ import numpy as np
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import TaskSettings
 from pup.locomotion.task import WalkingTask
+from pup.physics.engine import Engine
 from pup.robot import RobotDescription
 from pup.sysid.result import FittedBounds
 
@@ -20,15 +21,20 @@ class Walking:
       bounds: of its parameters.
       settings: of the task.
       nominal: whether all episodes have the fitted parameters, instead of some from the bounds.
+      engine: what simulates.
     """
 
     robot: RobotDescription
     bounds: FittedBounds
     settings: TaskSettings
     nominal: bool = False
+    engine: Engine = Engine.MUJOCO
 
     def __call__(self, simulations: int, seed: int, threads: int) -> WalkingTask:
         """See `rollouts.MakeTask`."""
         of = ParameterSampler.nominal if self.nominal else ParameterSampler
         rng = np.random.default_rng(seed)
-        return WalkingTask(self.robot, of(self.bounds), self.settings, simulations, rng, threads)
+        sampler = of(self.bounds)
+        return WalkingTask(
+            self.robot, sampler, self.settings, simulations, rng, threads, self.engine
+        )

@@ -107,8 +107,7 @@ class Simulations:
         edges = np.linspace(0, n, threads + 1).astype(np.int64)
         self._edges = edges
         self._parts = [
-            _Part(robot, largest, actuator, int(b - a), substeps, period)
-            for a, b in pairwise(edges)
+            Part(robot, largest, actuator, int(b - a), substeps, period) for a, b in pairwise(edges)
         ]
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
@@ -177,7 +176,7 @@ def _joined(parts: list[P]) -> P:
     )
 
 
-class _Part:
+class Part:
     """One batch."""
 
     def __init__(
@@ -345,12 +344,8 @@ class _Part:
 
 def _sense(robot: RobotDescription, spec: mujoco.MjSpec) -> None:
     """Sensors for the centre of mass's velocity, then for the contacts of each allowed body."""
-    assert robot.gait is not None and robot.torso is not None
-    spec.add_sensor(
-        type=mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        objname=robot.torso,
-    )
+    sense_drift(robot, spec)
+    assert robot.gait is not None
     for body in robot.gait.ground_bodies:
         spec.add_sensor(
             type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -360,3 +355,12 @@ def _sense(robot: RobotDescription, spec: mujoco.MjSpec) -> None:
             refname=FLOOR,
             intprm=[_COUNT, 0, 1],
         )
+
+
+def sense_drift(robot: RobotDescription, spec: mujoco.MjSpec) -> None:
+    """Extend a model by a sensor for the velocity of the centre of mass."""
+    spec.add_sensor(
+        type=mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        objname=robot.torso,
+    )

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.locomotion.engines import make_simulations
 from pup.locomotion.reference import Reference
 from pup.locomotion.sampling import MARGIN, ParameterSampler
 from pup.locomotion.settings import TaskSettings
-from pup.locomotion.simulations import Motion, Pose, Simulations
+from pup.locomotion.simulations import Motion, Pose
 from pup.locomotion.start import Starts
+from pup.physics.engine import Engine
 from pup.physics.outfit import mount
 from pup.physics.rotations import multiply, roll_pitch
 from pup.robot import Gait, RobotDescription
@@ -116,9 +118,10 @@ class WalkingTask:
       n: simulations.
       rng: draws everything that is random.
       threads: None for as many as there are cores.
+      engine: what simulates.
 
     Raises:
-      InputError: the robot cannot walk, or a term of it cannot act.
+      InputError: the robot cannot walk, a term of it cannot act, or the engine does not do.
     """
 
     def __init__(
@@ -129,6 +132,7 @@ class WalkingTask:
         n: int,
         rng: np.random.Generator,
         threads: int | None = None,
+        engine: Engine = Engine.MUJOCO,
     ) -> None:
         self.robot = robot
         self.gait = _gait(robot)
@@ -146,7 +150,8 @@ class WalkingTask:
         self._across = np.array([-self._axis[1], self._axis[0]])
         self._starts = Starts(robot, self.reference.start, settings, n)
         bounds = sampler.bounds
-        self._simulations = Simulations(
+        self._simulations = make_simulations(
+            engine,
             robot,
             sampler.largest(),
             bounds.actuator,
