@@ -282,6 +282,8 @@ class _Job:
                 f"{folder}: a {card.method} policy of other sizes or parameters; start from a "
                 f"{self.options.method} policy trained on bounds of the same parameters"
             )
+        if "critic.0.weight" not in weights:
+            raise InputError(f"{folder}: has no value function; start from what `pup train` wrote")
         self.origin = {
             "policy_sha256": hashlib.sha256((folder / CARD).read_bytes()).hexdigest(),
             "bounds_sha256": card.bounds_sha256,

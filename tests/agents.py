@@ -89,12 +89,17 @@ def bundle(
     shape = PolicyShape.of(Method.PUP, len(OBSERVATION), len(parameters), len(DARWIN.joints))
     rng = np.random.default_rng(0)
     weights: dict[str, np.ndarray] = {
+        "observations.count": np.array(1.0),
         "observations.mean": np.zeros(len(OBSERVATION)),
         "observations.variance": np.ones(len(OBSERVATION)),
+        "returns.count": np.array(1.0),
+        "returns.mean": np.zeros(1),
+        "returns.variance": np.ones(1),
     }
     for name, sizes in (
         ("actor", (shape.proprioception + shape.eta, *shape.hidden, shape.bins * shape.joints)),
         ("projection", (shape.parameters, *shape.projection, shape.latent)),
+        ("critic", (shape.proprioception + shape.privileged, *shape.hidden, 1)),
     ):
         for i, (inputs, outputs) in enumerate(pairwise(sizes)):
             spread = 0.2 if lively else 0.01

@@ -12,13 +12,13 @@ import psutil
 import pytest
 from commandline import files, pup
 from jobs import Job, command_of, until
-from test_report import Page
 
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
 from pup.sysid.virtual import record
 from services.pipeline import POLICIES
 from services.stages import sha256
+from tests.reports import Page
 
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")

@@ -8,7 +8,6 @@ import agents
 import pytest
 from commandline import TINY, files, pup
 from refusals import Place, assert_refused
-from test_report import Page
 
 from pup.errors import InputError
 from pup.files import write_json
@@ -17,6 +16,7 @@ from pup.sysid.result import read_bounds
 from services.job_report import Job, found, write_report
 from services.pipeline import POLICIES
 from services.stages import Done, Journal, Stage
+from tests.reports import Page
 
 DARWIN = RobotDescription.load("darwin_op2")
 
