@@ -3,7 +3,7 @@
 import ipaddress
 
 import pytest
-from manifests import OVERLAYS, Document, jobs, overlay, pods, selects
+from manifests import OVERLAYS, Document, jobs, one, overlay, pods, selects
 
 from services.gateway.config import Config
 
@@ -42,7 +42,7 @@ class End:
 
 OUTSIDE = {"kubernetes.io/metadata.name": "elsewhere"}
 ROBOT = End(None, address="192.168.7.20")
-INTERNET = End(None, address="93.184.216.34")
+INTERNET = End(None, address="203.0.113.7")
 DNS = End({"k8s-app": "kube-dns"}, {"kubernetes.io/metadata.name": "kube-system"})
 OPERATOR = End({"app.kubernetes.io/name": "kuberay-operator"}, OUTSIDE)
 PROMETHEUS = End({"app.kubernetes.io/name": "prometheus"}, OUTSIDE)
@@ -89,6 +89,12 @@ def _side(name: str, way: str, held: End, other: End, port: int, protocol: str) 
 
 
 @pytest.mark.parametrize("name", OVERLAYS)
+def test_all_is_denied_by_default(name: str) -> None:
+    policy = one(overlay(name), "NetworkPolicy", "default-deny")["spec"]
+    assert policy == {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
+
+
+@pytest.mark.parametrize("name", OVERLAYS)
 def test_what_is_needed_is_let_through(name: str) -> None:
     there = ends(name)
     gateway, head, worker = there["gateway"], there["head"], there["worker"]
@@ -101,8 +107,8 @@ def test_what_is_needed_is_let_through(name: str) -> None:
     assert may(name, there["submitter"], there["job's head"], DASHBOARD)
     assert may(name, OPERATOR, head, DASHBOARD)
     assert may(name, head, INTERNET, 6443) and may(name, head, INTERNET, 443)  # API server
-    for one in there.values():
-        assert may(name, one, DNS, 53) and may(name, one, DNS, 53, "UDP")
+    for end in there.values():
+        assert may(name, end, DNS, 53) and may(name, end, DNS, 53, "UDP")
     cluster = name != "dev"
     assert may(name, PROMETHEUS, gateway, PAGES) is cluster
     assert may(name, PROMETHEUS, worker, METRICS) is cluster
@@ -117,16 +123,16 @@ def test_what_is_not_needed_is_not(name: str) -> None:
     assert not may(name, INTERNET, gateway, LINK)
     for port in (PAGES, LINK):
         assert not may(name, STRANGER, gateway, port)
-    for one in (ROBOT, INGRESS, STRANGER, PROMETHEUS):
-        assert not may(name, one, head, DASHBOARD)
-        assert not may(name, one, worker, ANY)
+    for end in (ROBOT, INGRESS, STRANGER, PROMETHEUS):
+        assert not may(name, end, head, DASHBOARD)
+        assert not may(name, end, worker, ANY)
     assert not may(name, gateway, head, GCS)
     assert not may(name, gateway, worker, ANY)
-    for one in (head, worker, there["submitter"]):
-        assert not may(name, one, gateway, PAGES)
-        assert not may(name, one, gateway, LINK)
+    for end in (head, worker, there["submitter"]):
+        assert not may(name, end, gateway, PAGES)
+        assert not may(name, end, gateway, LINK)
     assert not may(name, there["submitter"], head, GCS)
-    for one in (gateway, worker, there["submitter"]):
-        assert not may(name, one, INTERNET, 443)
+    for end in (gateway, worker, there["submitter"]):
+        assert not may(name, end, INTERNET, 443)
     assert not may(name, OPERATOR, head, GCS)
     assert not may(name, worker, INTERNET, 5432)
