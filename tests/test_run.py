@@ -172,6 +172,7 @@ def _of(run: Run, name: str) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.ray
+@pytest.mark.timeout(3600)
 def test_killed_at_every_stage_it_ends_as_if_nothing_had_happened(
     command: tuple[object, ...], tmp_path: Path
 ) -> None:
