@@ -65,7 +65,7 @@ class ParameterSampler:
 
     def physical(self, unit: Array) -> Array:
         """The reverse of `unit`."""
-        return np.asarray(self.bounds.lower + unit * self._width)
+        return np.asarray(self.bounds.lower + unit * (self.bounds.upper - self.bounds.lower))
 
     def candidates(self, unit: Array) -> Candidates:
         """All of the robot's parameters for mu on the unit scale, shape (n, n_parameters)."""
