@@ -69,7 +69,7 @@ def test_a_fragment_is_what_the_task_told() -> None:
     assert len(fragment.ended) == over.sum()
     assert fragment.ended[:, 3].sum() == fragment.terminated.sum()
     assert (fragment.reward[~fragment.live] == 0).all()
-    whole = np.isclose(fragment.ended[:, 2], 0.1 * EPISODE)
+    whole = np.isclose(fragment.ended[:, 2], 0.1 * EPISODE) & (fragment.ended[:, 3] == 0)
     assert whole.sum() == fragment.truncated.sum()
     i = int(np.flatnonzero(fragment.truncated.any(axis=0))[0])
     end = int(np.flatnonzero(fragment.truncated[:, i])[0])
