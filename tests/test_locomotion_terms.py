@@ -16,7 +16,7 @@ from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import TaskSettings
 from pup.locomotion.simulations import Motion, Pose, Simulations
 from pup.locomotion.task import WalkingTask
-from pup.physics.mujoco_batch import MujocoSimulator, _Run
+from pup.physics.mujoco_batch import MujocoSimulator, Run
 from pup.physics.outfit import mount
 from pup.physics.parameters import Candidates, robot_space
 from pup.physics.rotations import multiply, roll_pitch
@@ -80,7 +80,7 @@ def both_ways(
     run, reads = told_and_read(targets, clock)
     simulator = MujocoSimulator(DARWIN, [run], actuator)
     replayed = simulator.replay(candidates)
-    begun = _Run(DARWIN, simulator.groups[0], candidates, simulator.law)
+    begun = Run(DARWIN, simulator.groups[0], candidates, simulator.law)
     n, largest = len(candidates), candidates.space.candidates(candidates.values.max(axis=0))
     ours = Simulations(DARWIN, largest, actuator, n, SUBSTEPS, PERIOD, 1)
     ours.start(
