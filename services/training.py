@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import write_json
+from pup.locomotion.engines import check_size
 from pup.locomotion.sampling import MARGIN
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.locomotion.task import WalkingTask
@@ -152,6 +153,7 @@ class _Job:
         self.bounds_sha256 = hashlib.sha256(self.source.read_bytes()).hexdigest()
         self.settings = TaskSettings(direction=options.direction)
         nominal = options.method == Method.NOMINAL
+        check_size(options.engine, options.simulations)
         self.walking = Walking(robot, self.bounds, self.settings, nominal, options.engine)
         task = self.walking(1, 0, 1)
         self.shape = PolicyShape.of(

@@ -99,6 +99,14 @@ def test_a_policy_walks_in_mujoco_only(tmp_path: Path) -> None:
     assert told.code == 2 and "--engine brax" in told.err
 
 
+def test_more_robots_than_a_processor_can_step_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("brax")
+    given = ("train", "--robot", "darwin_op2", "--engine", "brax", "--simulations", 64)
+    told = pup(*given, "--out", tmp_path / "out")
+    assert told.code == 2 and "--simulations 16" in told.err and len(told.err.splitlines()) == 1
+    assert not (tmp_path / "out" / "checkpoint.npz").exists()
+
+
 # --- With it --------------------------------------------------------------------------------------
 
 
