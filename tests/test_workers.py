@@ -1,8 +1,6 @@
 """Fits on a real Ray: the same to the last bit as in one process, whatever is killed meanwhile."""
 
-import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -12,7 +10,6 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-import ray
 
 from pup.errors import InputError
 from pup.physics.parameters import robot_space
@@ -177,19 +174,3 @@ def test_more_fits_than_run_at_once(runner: RayRunner, fits: list[Fit], tmp_path
     ]
     local = LocalRunner().run(many, tmp_path / "local", lambda _: None)
     assert_same(runner.run(many, tmp_path / "ray", lambda _: None), local)
-
-
-@pytest.mark.ray
-@pytest.mark.parametrize("seconds", [0.1, 0.3, 0.6, 0.9, 1.2])
-def test_a_stop_while_ray_starts_is_kept(seconds: float) -> None:
-    """Ray's own answer to SIGTERM can be lost where its start raises it."""
-    usual = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
-    try:
-        with pytest.raises(KeyboardInterrupt), connected(cores=1):
-            time.sleep(60)
-        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGTERM, usual)
-    assert not ray.is_initialized()
