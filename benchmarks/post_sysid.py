@@ -12,7 +12,6 @@ Robots that are done are kept in `--out`; the same command goes on.
 """
 
 import argparse
-import hashlib
 import itertools
 import json
 import statistics
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pup.files import read_json, write_json
+from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
@@ -142,7 +141,7 @@ def main() -> None:
     simulated = read_simulated(given.simulated) if given.simulated else None
     robot = RobotDescription.load(given.robot)
     plan = Plan(robot, given.policy, given.side, simulated, given.trials, given.out)
-    digest = hashlib.sha256((given.policy / CARD).read_bytes()).hexdigest()
+    digest = sha256(given.policy / CARD)
     rows = []
     for seed in range(given.first, given.first + given.robots):
         file = given.out / f"robot{seed}.json"

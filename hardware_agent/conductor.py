@@ -4,7 +4,6 @@ accepted → (enabled, cool, and let start by whoever stands there) armed → st
 feet → settled → written down as running → walking → ended → distance → finished.
 """
 
-import hashlib
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,6 +21,7 @@ from hardware_agent.policies import Shelf
 from hardware_agent.rollout import Rollout, recording_of
 from hardware_agent.trials import TrialBook
 from pup.errors import InputError
+from pup.files import sha256
 from pup.robot import RobotDescription
 from pup.wire import (
     CHUNK,
@@ -271,7 +271,7 @@ class Conductor:
         made = recording_of(event.assign, event.rollout, self._robot.name, control.source, notes)
         file = self._file(made.id)
         made.write(file)
-        return made.id, hashlib.sha256(file.read_bytes()).hexdigest()
+        return made.id, sha256(file)
 
     def _finish(self, outcome: Outcome, reason: str, distance: float | None = None) -> None:
         assert self._assign is not None

@@ -1,9 +1,9 @@
 """The policy bundles that lie on the robot's computer."""
 
-import hashlib
 from pathlib import Path
 
 from pup.errors import InputError
+from pup.files import sha256
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.wire import Policy
@@ -16,7 +16,7 @@ def digest_of(bundle: Path) -> str:
       InputError: there is no card.
     """
     try:
-        return hashlib.sha256((bundle / CARD).read_bytes()).hexdigest()
+        return sha256(bundle / CARD)
     except OSError as error:
         raise InputError(f"{bundle / CARD}: cannot be read ({error.strerror})") from error
 

@@ -1,5 +1,6 @@
 """Files written whole or not at all, and JSON read within limits."""
 
+import hashlib
 import json
 import os
 import tempfile
@@ -43,6 +44,11 @@ def _umask() -> int:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON document atomically; NaN and infinity are refused."""
     write_atomic(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_json(path: Path, limit: int = JSON_LIMIT) -> Any:

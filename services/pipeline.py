@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from pup.errors import InputError
+from pup.files import sha256
 from pup.policy.bundle import CARD, GRAPH, WEIGHTS, read_bundle
 from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
 from services.presysid import Options, Progress, identify
 from services.replay import replay
-from services.stages import Journal, Stage, content, sha256
+from services.stages import Journal, Stage, content
 from workers.fits import Runner
 
 SHIPPED = "recordings"

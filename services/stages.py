@@ -1,6 +1,5 @@
 """Stages of a job, each done once: `run.json` tells from what, and what came of it."""
 
-import hashlib
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pup.errors import InputError
-from pup.files import read_json, write_json
+from pup.files import read_json, sha256, write_json
 
 JOURNAL = "run.json"
 
@@ -94,11 +93,6 @@ class Journal:
     def _files(self, stage: Stage) -> dict[str, str]:
         there = [name for name in stage.files if (self.out / name).is_file()]
         return {name: sha256(self.out / name) for name in there}
-
-
-def sha256(file: Path) -> str:
-    """SHA-256 of a file's content."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def content(out: Path, name: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.files import write_json
+from pup.files import sha256, write_json
 from pup.locomotion.engines import check_size
 from pup.locomotion.sampling import MARGIN
 from pup.locomotion.settings import Direction, TaskSettings
@@ -150,7 +150,7 @@ class _Job:
                 f"robot {robot.name!r} comes without identified bounds; give some with --bounds"
             )
         self.bounds = read_bounds(self.source, robot)
-        self.bounds_sha256 = hashlib.sha256(self.source.read_bytes()).hexdigest()
+        self.bounds_sha256 = sha256(self.source)
         self.settings = TaskSettings(direction=options.direction)
         nominal = options.method == Method.NOMINAL
         check_size(options.engine, options.simulations)
@@ -287,7 +287,7 @@ class _Job:
         if "critic.0.weight" not in weights:
             raise InputError(f"{folder}: has no value function; start from what `pup train` wrote")
         self.origin = {
-            "policy_sha256": hashlib.sha256((folder / CARD).read_bytes()).hexdigest(),
+            "policy_sha256": sha256(folder / CARD),
             "bounds_sha256": card.bounds_sha256,
             "other_bounds": card.bounds_sha256 != self.bounds_sha256,
             "steps": card.provenance.get("steps"),

@@ -1,6 +1,5 @@
 """The job behind `pup transfer`: a study on a running gateway, followed to its end."""
 
-import hashlib
 import os
 import time
 import uuid
@@ -12,7 +11,7 @@ from typing import Any
 import httpx
 
 from pup.errors import InputError
-from pup.files import read_json, write_json
+from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.transfer.study import Gate
 from services.gateway.keys import check_name
@@ -158,7 +157,7 @@ def transfer(
     check_name(wanted.study)
     policy = NumpyPolicy.load(wanted.policy)
     card = policy.card
-    digest = hashlib.sha256((wanted.policy / CARD).read_bytes()).hexdigest()
+    digest = sha256(wanted.policy / CARD)
     gateway = Gateway(wanted.url, wanted.token, told)
     asked = {
         "name": wanted.study,

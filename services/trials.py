@@ -1,6 +1,5 @@
 """Post-sysID of a job: a virtual robot walks until eta is chosen, unattended (paper, section V)."""
 
-import hashlib
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.files import write_json
+from pup.files import sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import FittedBounds, read_bounds
@@ -149,7 +148,7 @@ def _document(
     return {
         "schema": SCHEMA,
         "robot": study["robot"],
-        "policy_sha256": hashlib.sha256((policy / CARD).read_bytes()).hexdigest(),
+        "policy_sha256": sha256(policy / CARD),
         "virtual_robot": budget.seed,
         "horizon": study["settings"]["horizon"],
         "eta": study["eta"],

@@ -13,11 +13,11 @@ import pytest
 from commandline import files, pup
 from jobs import Job, command_of, until
 
+from pup.files import sha256
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
 from pup.sysid.virtual import record
 from services.pipeline import POLICIES
-from services.stages import sha256
 from tests.reports import Page
 
 pytest.importorskip("fastapi")

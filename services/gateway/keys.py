@@ -8,7 +8,6 @@ key of each agent in `curve/agents/<name>.key`. The name of the file is the name
 import hashlib
 import hmac
 import os
-import re
 import secrets
 from dataclasses import dataclass
 from enum import IntEnum
@@ -19,8 +18,8 @@ import zmq.auth
 
 from pup.errors import InputError
 from pup.files import read_json, write_json
+from services.gateway.names import is_name
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 SCHEMA = 1
 
 
@@ -181,7 +180,7 @@ def check_name(name: str) -> None:
     Raises:
       InputError: it is none.
     """
-    if not NAME.fullmatch(name):
+    if not is_name(name):
         raise InputError(f"{name[:70]!r} is no name: use 1 to 63 letters, digits, '-', '_' and '.'")
 
 

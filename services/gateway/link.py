@@ -5,7 +5,6 @@ id, which it may choose, are not asked.
 """
 
 import asyncio
-import hashlib
 import logging
 import os
 import re
@@ -17,7 +16,7 @@ import zmq.asyncio
 from zmq.auth.asyncio import AsyncioAuthenticator
 
 from pup.errors import InputError
-from pup.files import write_atomic
+from pup.files import sha256, write_atomic
 from pup.wire import (
     CHUNK,
     SIZE_LIMIT,
@@ -256,5 +255,5 @@ class Link:
             for file in parts.iterdir():
                 os.unlink(file)
             parts.rmdir()
-            digest = hashlib.sha256(whole.read_bytes()).hexdigest()
+            digest = sha256(whole)
             log.info("recording", extra={"agent": agent, "file": str(whole), "sha256": digest})
