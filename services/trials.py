@@ -111,8 +111,7 @@ def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]
     if unknown := [name for name in card.parameters if name not in names]:
         raise InputError(f"the policy is of a model with {unknown[0]!r}, which the fitted has not")
     mu = bounds.space.nominal[[names.index(name) for name in card.parameters]]
-    lower, upper = np.array(card.parameter_lower), np.array(card.parameter_upper)
-    return policy.project((mu - lower) / np.where(upper > lower, upper - lower, 1.0))
+    return policy.project(card.scale.unit(mu))
 
 
 def attend(gateway: Gateway, study: dict[str, Any]) -> None:

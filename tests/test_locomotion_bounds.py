@@ -1,14 +1,19 @@
 """Bounds that parameters are drawn from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from walking import BOUNDS, DARWIN
 
 from pup.errors import InputError
+from pup.locomotion.sampling import ParameterSampler
 from pup.sysid.result import read_bounds
 
 
@@ -45,3 +50,30 @@ def test_wrong_bounds_are_refused(tmp_path: Path, entry: dict[str, Any], words: 
     with pytest.raises(InputError) as refused:
         read_bounds(changed(tmp_path, **entry), DARWIN)
     assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
+@given(arrays(np.float64, (5, 14), elements=st.floats(-0.5, 1.5)), st.sets(st.integers(0, 13)))
+def test_the_unit_scale_has_an_inverse_also_where_bounds_are_one(
+    unit: np.ndarray, pinned: set[int]
+) -> None:
+    upper = BOUNDS.upper.copy()
+    upper[list(pinned)] = BOUNDS.lower[list(pinned)]
+    sampler = ParameterSampler(replace(BOUNDS, upper=upper))
+    np.testing.assert_allclose(sampler.unit(sampler.physical(unit)), unit, atol=1e-12)
+
+
+def test_a_parameter_whose_bounds_are_one_has_that_value_in_every_episode() -> None:
+    """Unless it is given another, which it then has."""
+    pinned = [BOUNDS.names.index(name) for name in ("rho/arm", "ground_friction")]
+    lower, upper = BOUNDS.lower.copy(), BOUNDS.upper.copy()
+    lower[pinned] = upper[pinned] = (BOUNDS.lower + BOUNDS.upper)[pinned] / 2
+    bounds = replace(BOUNDS, lower=lower, upper=upper)
+    sampler = ParameterSampler(bounds)
+    mu = sampler.draw(np.random.default_rng(0), np.arange(200))
+    assert (mu[:, pinned] == 0).all() and (np.ptp(mu, axis=0) > 0).sum() == 12
+    for values in (sampler.candidates(mu), sampler.largest()):
+        held = values.columns(bounds.names)[:, pinned]
+        np.testing.assert_array_equal(held, np.broadcast_to(lower[pinned], held.shape))
+    nominal = ParameterSampler.nominal(bounds)
+    values = nominal.candidates(nominal.draw(np.random.default_rng(0), np.arange(1)))
+    np.testing.assert_allclose(values.values[0], bounds.space.nominal, rtol=1e-12)

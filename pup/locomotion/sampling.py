@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.parameters import Candidates
+from pup.policy.scale import UnitScale
 from pup.sysid.result import FittedBounds
 
 Array = NDArray[np.float64]
@@ -15,8 +16,8 @@ MARGIN = 0.05
 class ParameterSampler:
     """Draws mu ~ U(-0.05, 1.05) on the unit scale of the bounds, or repeats given ones.
 
-    On the unit scale 0 is the lower and 1 the upper bound. No parameter leaves its search range:
-    there a stiffness or a friction would be negative.
+    On the unit scale 0 is the lower and 1 the upper bound; where these are one, 0 is drawn. No
+    parameter leaves its search range: there a stiffness or a friction would be negative.
 
     Args:
       bounds: what pre-sysID found.
@@ -28,10 +29,10 @@ class ParameterSampler:
         self.bounds = bounds
         self.mu = None if mu is None else np.asarray(mu, dtype=np.float64)
         self._columns = [bounds.space.names.index(name) for name in bounds.names]
-        width = bounds.upper - bounds.lower
-        self._width = np.where(width > 0, width, 1.0)
-        self._lowest = self.unit(bounds.space.lower[self._columns])
-        self._highest = self.unit(bounds.space.upper[self._columns])
+        self._scale = UnitScale(bounds.lower, bounds.upper)
+        free, search = bounds.upper > bounds.lower, bounds.space.select(bounds.names)
+        self._lowest = np.maximum(self.unit(search.lower), np.where(free, -MARGIN, 0.0))
+        self._highest = np.minimum(self.unit(search.upper), np.where(free, 1 + MARGIN, 0.0))
 
     @classmethod
     def nominal(cls, bounds: FittedBounds) -> "ParameterSampler":
@@ -57,15 +58,15 @@ class ParameterSampler:
         """All of the robot's parameters, no smaller than any that will be drawn; one row."""
         if self.mu is not None:
             return self.candidates(self.unit(np.atleast_2d(self.mu).max(axis=0))[None])
-        return self.candidates(np.minimum(1 + MARGIN, self._highest)[None])
+        return self.candidates(self._highest[None])
 
     def unit(self, mu: Array) -> Array:
         """Physical values on the unit scale of the bounds, shape (..., n_parameters)."""
-        return np.asarray((mu - self.bounds.lower) / self._width)
+        return self._scale.unit(mu)
 
     def physical(self, unit: Array) -> Array:
-        """The reverse of `unit`."""
-        return np.asarray(self.bounds.lower + unit * (self.bounds.upper - self.bounds.lower))
+        """The inverse of `unit`."""
+        return self._scale.physical(unit)
 
     def candidates(self, unit: Array) -> Candidates:
         """All of the robot's parameters for mu on the unit scale, shape (n, n_parameters)."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import read_json, write_atomic, write_json
+from pup.policy.scale import UnitScale
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import Gait, Harmonics, RobotDescription
 
@@ -77,6 +78,11 @@ class PolicyCard:
     bounds_sha256: str
     robot_digest: str
     provenance: dict[str, Any]
+
+    @property
+    def scale(self) -> UnitScale:
+        """The unit scale of its parameters."""
+        return UnitScale(np.array(self.parameter_lower), np.array(self.parameter_upper))
 
     def document(self) -> dict[str, Any]:
         """The card as JSON values."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.policy.bundle import PolicyCard, Weights
+from pup.policy.scale import UnitScale
 from pup.policy.shape import PolicyShape
 
 Array = NDArray[np.float64]
@@ -24,21 +25,14 @@ def for_bounds(card: PolicyCard, weights: Weights, lower: Array, upper: Array) -
       lower: other bounds of `card.parameters`, physical, shape (n_parameters,).
       upper: upper ones.
     """
-    old_lower, old_width = _scale(np.array(card.parameter_lower), np.array(card.parameter_upper))
-    new_lower, new_width = _scale(lower, upper)
-    factor = new_width / old_width
-    shift = (2 * (new_lower - old_lower) + (new_width - old_width)) / old_width
+    old, new = card.scale, UnitScale(lower, upper)
+    factor = new.width / old.width
+    shift = (2 * (new.lower - old.lower) + (new.width - old.width)) / old.width
     told = dict(weights)
     for layer, first in _seeing(card.shape).items():
         if f"{layer}.weight" in told:
             told |= _moved(told, layer, first, factor, shift)
     return told
-
-
-def _scale(lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Where the unit scale begins and how wide it is, as `ParameterSampler` has it."""
-    width = upper - lower
-    return lower, np.where(width > 0, width, 1.0)
 
 
 def _seeing(shape: PolicyShape) -> dict[str, int]:
