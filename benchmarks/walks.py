@@ -17,17 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.paired import CORES, ROBOT
-from pup.locomotion.evaluation import Walks, evaluate
-from pup.locomotion.sampling import MARGIN, ParameterSampler
+from pup.locomotion.evaluation import Walks
+from pup.locomotion.landscape import walk_each
+from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
-from pup.locomotion.task import WalkingTask
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import FittedBounds, read_bounds
 
 Array = NDArray[np.float64]
-ROWS = 512
-"""Robots that walk at once."""
 
 
 class Trial:
@@ -46,17 +44,8 @@ class Trial:
 
     def walks(self, mu: Array, condition: Array, seed: int) -> Walks:
         """One episode for each row of mu, on the unit scale, and its condition."""
-        sampler = ParameterSampler(self.bounds)
-        sampler.mu = sampler.physical(mu)
-        rng = np.random.default_rng(seed)
-        task = WalkingTask(self.robot, sampler, self.settings, len(mu), rng, CORES)
-        return evaluate(lambda seen, _: self.policy.act(seen, condition), task)
-
-    def distances(self, mu: Array, condition: Array, seed: int) -> Array:
-        """Their distances, any number of them."""
-        parts = range(0, len(mu), ROWS)
-        told = [self.walks(mu[i : i + ROWS], condition[i : i + ROWS], seed + i) for i in parts]
-        return np.concatenate([walks.distance for walks in told])
+        act, rng = self.policy.act, np.random.default_rng(seed)
+        return walk_each(act, self.robot, self.bounds, self.settings, mu, condition, rng, CORES)
 
     def best(self, mu: Array, conditions: int, tries: int, seed: int) -> Array:
         """The best condition of each mu, shape (n, n_eta)."""
@@ -69,7 +58,7 @@ class Trial:
         all_of_them = np.concatenate([own[:, None], drawn], axis=1)
         flat = all_of_them.reshape(-1, card.shape.eta)
         rows = np.repeat(mu, conditions, axis=0)
-        told = sum(self.distances(rows, flat, seed + 7919 * (1 + i)) for i in range(tries))
+        told = sum(self.walks(rows, flat, seed + 7919 * (1 + i)).distance for i in range(tries))
         choice = np.argmax(np.reshape(told, (len(mu), conditions)), axis=1)
         return np.asarray(all_of_them[np.arange(len(mu)), choice])
 
@@ -94,7 +83,7 @@ def main() -> None:
     robot = RobotDescription.load(given.robot)
     bounds = read_bounds(given.bounds or robot.identified_path, robot)
     rng = np.random.default_rng(given.seed)
-    mu = rng.uniform(-MARGIN, 1 + MARGIN, (given.mu, len(bounds.names)))
+    mu = ParameterSampler(bounds).draw(rng, np.arange(given.mu))
     told = {}
     for folder in given.policies:
         trial = Trial(NumpyPolicy.load(folder, robot), robot, bounds)

@@ -1,6 +1,7 @@
 """The walking task's physics: symmetry, determinism, resumption, step size."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from walking import (
     walking,
 )
 
-from pup.locomotion.evaluation import evaluate
+from pup.locomotion.evaluation import Walks, evaluate
+from pup.locomotion.landscape import landscape
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.task import WalkingTask
 from pup.physics.parameters import robot_space
 from pup.physics.rotations import multiply
 from pup.sysid.result import FittedBounds
@@ -228,6 +231,34 @@ def test_the_pd_law_walks_too() -> None:
         step = task.step(idle(8))
     assert not step.terminated.all()
     assert np.isfinite(step.observation.proprioception).all()
+
+
+def test_a_landscape_walks_each_eta_on_each_of_the_drawn_parameters(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In batches; those with the same mu and eta walk alike. Mu is drawn as for training."""
+    seen: list[np.ndarray] = []
+
+    def policy(proprioception: np.ndarray, eta: np.ndarray) -> np.ndarray:
+        return idle(len(proprioception)) + np.rint(5 * eta).astype(int)
+
+    def evaluated(act: Any, task: WalkingTask) -> Walks:
+        assert task.n <= 4 and task.sampler.mu is not None
+        seen.append(task.sampler.mu)
+        return evaluate(act, task)
+
+    monkeypatch.setattr("pup.locomotion.landscape.BATCH", 4)
+    monkeypatch.setattr("pup.locomotion.landscape.evaluate", evaluated)
+    eta = np.array([[0.2], [-0.2], [0.2]])
+    short = replace(EXACT, horizon=0.4)
+    distance = landscape(policy, DARWIN, BOUNDS, short, eta, draws=3, seed=1, threads=1)
+    assert distance.shape == (3, 3)
+    np.testing.assert_allclose(distance[:, 0], distance[:, 2], rtol=1e-9)
+    assert (distance[:, 0] != distance[:, 1]).all() and len(set(distance[:, 0])) == 3
+    sampler = ParameterSampler(BOUNDS)
+    mu = sampler.physical(sampler.draw(np.random.default_rng(1), np.arange(3)))
+    assert [len(part) for part in seen] == [4, 4, 1]
+    np.testing.assert_array_equal(np.concatenate(seen), np.repeat(mu, 3, axis=0))
 
 
 def test_a_policy_is_judged_by_one_episode_of_each_simulation() -> None:

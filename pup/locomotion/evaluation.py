@@ -1,7 +1,7 @@
 """How far a policy walks."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,11 @@ class Walks:
     time: Array
     fell: NDArray[np.bool_]
     reward: Array
+
+    @classmethod
+    def joined(cls, parts: Sequence["Walks"]) -> "Walks":
+        """Those of all parts, one part after the other."""
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def summary(self) -> dict[str, float]:
         """Median distance and time, share without a fall, mean reward."""

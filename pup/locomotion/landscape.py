@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.locomotion.evaluation import evaluate
-from pup.locomotion.sampling import MARGIN, ParameterSampler
+from pup.locomotion.evaluation import Walks, evaluate
+from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import TaskSettings
 from pup.locomotion.task import Action, WalkingTask
 from pup.robot import RobotDescription
@@ -45,15 +45,40 @@ def landscape(
     Returns:
       Distances, m, shape (draws, n_points).
     """
-    sampler = ParameterSampler(bounds)
     rng = np.random.default_rng(seed)
-    mu = rng.uniform(-MARGIN, 1 + MARGIN, (draws, len(sampler.names)))
-    rows, conditions = np.repeat(sampler.physical(mu), len(eta), axis=0), np.tile(eta, (draws, 1))
-    told = []
-    for first in range(0, len(rows), BATCH):
-        of, condition = rows[first : first + BATCH], conditions[first : first + BATCH]
-        given = ParameterSampler(bounds, of)
-        task = WalkingTask(robot, given, settings, len(of), rng, threads)
-        walks = evaluate(lambda seen, _, eta=condition: policy(seen, eta), task)  # type: ignore[misc]
-        told.append(walks.distance)
-    return np.concatenate(told).reshape(draws, len(eta))
+    mu = ParameterSampler(bounds).draw(rng, np.arange(draws))
+    rows, conditions = np.repeat(mu, len(eta), axis=0), np.tile(eta, (draws, 1))
+    walks = walk_each(policy, robot, bounds, settings, rows, conditions, rng, threads)
+    return walks.distance.reshape(draws, len(eta))
+
+
+def walk_each(
+    policy: Conditioned,
+    robot: RobotDescription,
+    bounds: FittedBounds,
+    settings: TaskSettings,
+    mu: Array,
+    eta: Array,
+    rng: np.random.Generator,
+    threads: int,
+) -> Walks:
+    """One episode on each of some parameters, each with a condition of its own.
+
+    Args:
+      policy: walks as it is conditioned.
+      robot: the robot.
+      bounds: of its parameters.
+      settings: of the task.
+      mu: on the unit scale of the bounds, shape (n, n_parameters).
+      eta: shape (n, n_eta).
+      rng: draws everything else that is random.
+      threads: cores to use.
+    """
+    physical = ParameterSampler(bounds).physical(mu)
+
+    def walked(mu: Array, eta: Array) -> Walks:
+        task = WalkingTask(robot, ParameterSampler(bounds, mu), settings, len(mu), rng, threads)
+        return evaluate(lambda seen, _: policy(seen, eta), task)
+
+    parts = (slice(first, first + BATCH) for first in range(0, len(mu), BATCH))
+    return Walks.joined([walked(physical[part], eta[part]) for part in parts])
