@@ -2,7 +2,7 @@
 
 Each robot is walked through the real chain: gateway, agent, Dynamixel packets on a pseudo-terminal;
 in lock-step. The grid is walked through it too: twice everywhere, and where that is best five times
-more, by which the best of the grid is told. What a study found is told by five walks of what it
+more, by which its best is both chosen and told. What a study found is told by five walks of what it
 chose. `--simulated` gives rollouts of `pup replay --landscape`: a second, shorter study begins with
 them.
 
@@ -15,6 +15,7 @@ import argparse
 import itertools
 import json
 import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,9 @@ from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
-from services.laboratory import AGENT, Laboratory
-from services.transfer import Gateway, Wanted, read_simulated, transfer
-from services.trials import LEASE, attend, fitted_eta
+from services.laboratory import Laboratory
+from services.transfer import read_simulated
+from services.trials import Budget, fitted_eta, follow
 
 AT_ONCE = 16
 """Etas that a study compares at most."""
@@ -66,43 +67,39 @@ class Plan:
         bounds = read_bounds(self.robot.identified_path, self.robot)
         fitted = fitted_eta(NumpyPolicy.load(self.policy, self.robot), bounds).tolist()
         with Laboratory(folder, self.robot, self.policy, seed) as laboratory:
-            walks = _Walks(self, laboratory, folder, seed)
-            cold = walks.study("cold", trials=25, repeats=5, compare=[fitted])
+            walks = _Walks(laboratory, folder, seed)
+            cold = walks.study("cold", trials=25, compare=[fitted])
             told = {"seed": seed, "cold": _mean(cold, "repeat"), "fitted": _mean(cold, "compare")}
             told["eta"] = cold["eta"]
             if self.simulated is not None:
-                warm = walks.study("warm", trials=self.trials, repeats=5, simulated=self.simulated)
+                warm = walks.study("warm", trials=self.trials, simulated=self.simulated)
                 told["warm"] = _mean(warm, "repeat")
             told["grid"] = walks.best_of(self.grid())
         return told
 
 
 class _Walks:
-    def __init__(self, plan: Plan, laboratory: Laboratory, folder: Path, seed: int) -> None:
-        self.plan, self.laboratory, self.folder, self.seed = plan, laboratory, folder, seed
+    def __init__(self, laboratory: Laboratory, folder: Path, seed: int) -> None:
+        self.laboratory, self.folder, self.seed = laboratory, folder, seed
 
-    def study(self, name: str, simulated: Any = None, **settings: Any) -> dict[str, Any]:
+    def study(
+        self,
+        name: str,
+        trials: int,
+        repeats: int = 5,
+        compare: Sequence[Sequence[float]] = (),
+        simulated: dict[str, Any] | None = None,
+    ) -> dict[str, Any]:
         """A study to its end."""
-        known = {
-            "initial": min(5, settings["trials"]),
-            "compare": [],
-            "lease": LEASE,
-            "failures": 1,
-            "gate": "auto",
-            "agent": AGENT,
-            "seed": self.seed,
-        }
-        lab = self.laboratory
-        wanted = Wanted(self.plan.policy, name, lab.url, lab.token, known | settings, simulated)
-
-        def tend(gateway: Gateway, study: dict[str, Any]) -> None:
-            lab.tend()
-            attend(gateway, study)
-
-        return transfer(wanted, self.folder / name, lambda _: lab.tend(), tend)
+        budget, out = Budget(trials, repeats, self.seed), self.folder / name
+        return follow(self.laboratory, name, budget, compare, out, lambda _: None, simulated)
 
     def best_of(self, grid: list[list[float]]) -> float:
-        """Mean distance of the best eta of a grid, by walks that did not choose it."""
+        """Mean distance of the best eta of a grid, told too large rather than too small.
+
+        Two walks of each choose five, and five more walks of each of these choose the best and tell
+        its mean: that is chosen by the walks that tell it.
+        """
         rough = [
             self.study(f"grid{i}", trials=1, repeats=2, compare=grid[i : i + AT_ONCE])
             for i in range(0, len(grid), AT_ONCE)
@@ -113,7 +110,7 @@ class _Walks:
             for eta in study["settings"]["compare"]
         }
         best = sorted(means, key=lambda eta: -means[eta])[:5]
-        again = self.study("best", trials=1, repeats=5, compare=[list(eta) for eta in best])
+        again = self.study("best", trials=1, compare=best)
         return max(_mean(again, "compare", list(eta)) for eta in best)
 
 

@@ -1,7 +1,7 @@
 """Post-sysID of a job: a virtual robot walks until eta is chosen, unattended (paper, section V)."""
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,11 +72,45 @@ def try_out(
     """
     bundle = NumpyPolicy.load(policy, robot)
     fitted = fitted_eta(bundle, read_bounds(bounds, robot))
+    with Laboratory(out, robot, policy, budget.seed) as laboratory:
+        study = follow(laboratory, STUDY, budget, [fitted.tolist()], out, told)
+    document = _document(study, fitted, budget, policy)
+    write_json(out / "transfer.json", document)
+    return document
+
+
+def follow(
+    laboratory: Laboratory,
+    name: str,
+    budget: Budget,
+    compare: Sequence[Sequence[float]],
+    out: Path,
+    told: Callable[[str], None],
+    simulated: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """A study in a laboratory to its end; both are looked after.
+
+    Args:
+      laboratory: where it is walked, by the policy that is there.
+      name: of the study.
+      budget: how many walks.
+      compare: etas that are walked beside the chosen one.
+      out: folder for `study.json`.
+      told: hears how far it is.
+      simulated: rollouts that it begins with.
+
+    Returns:
+      The document of `study.json`.
+
+    Raises:
+      InputError: as `try_out`.
+      ChildProcessError: likewise.
+    """
     settings = {
         "trials": budget.trials,
         "initial": min(StudySettings.initial, budget.trials),
         "repeats": budget.repeats,
-        "compare": [fitted.tolist()],
+        "compare": [list(eta) for eta in compare],
         "horizon": budget.horizon,
         "lease": LEASE,
         "failures": 1,  # each is looked at by `attend`
@@ -84,21 +118,17 @@ def try_out(
         "agent": AGENT,
         "seed": budget.seed,
     }
-    with Laboratory(out, robot, policy, budget.seed) as laboratory:
 
-        def tell(line: str) -> None:
-            laboratory.tend()  # also while the gateway does not answer
-            told(line)
+    def tell(line: str) -> None:
+        laboratory.tend()  # also while the gateway does not answer
+        told(line)
 
-        def tend(gateway: Gateway, study: dict[str, Any]) -> None:
-            laboratory.tend()
-            attend(gateway, study)
+    def tend(gateway: Gateway, study: dict[str, Any]) -> None:
+        laboratory.tend()
+        attend(gateway, study)
 
-        wanted = Wanted(policy, STUDY, laboratory.url, laboratory.token, settings)
-        study = transfer(wanted, out, tell, tend)
-    document = _document(study, fitted, budget, policy)
-    write_json(out / "transfer.json", document)
-    return document
+    place = laboratory.url, laboratory.token
+    return transfer(Wanted(laboratory.policy, name, *place, settings, simulated), out, tell, tend)
 
 
 def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]:
