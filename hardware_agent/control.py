@@ -19,7 +19,7 @@ Answer = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class Unreachable(InputError):  # noqa: N818
-    """No agent listens."""
+    """Nobody listens."""
 
 
 class ControlServer(threading.Thread):
@@ -90,7 +90,7 @@ class _Handler(socketserver.StreamRequestHandler):
 
 
 def say(path: Path, command: dict[str, Any]) -> dict[str, Any]:
-    """Send a command to the agent that listens at a path.
+    """Send a command to whoever listens at a path: an agent, or a virtual robot's side door.
 
     Raises:
       Unreachable: none does.

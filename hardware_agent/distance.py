@@ -4,15 +4,15 @@ The paper measures by hand, the distance alone, and notes that any other measure
 """
 
 import hashlib
-import json
 import math
 import os
-import socket
 import subprocess
 from pathlib import Path
 from typing import Any, Protocol
 
 from hardware_agent.config import DistanceSettings
+from hardware_agent.control import Unreachable, say
+from pup.errors import InputError
 from pup.wire import Assign
 
 AXES = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "sideways": (0.0, -1.0)}
@@ -151,17 +151,11 @@ class Virtual:
 
     def _say(self, command: dict[str, Any]) -> dict[str, Any]:
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as door:
-                door.settimeout(10.0)
-                door.connect(str(self._path))
-                door.sendall(json.dumps(command).encode() + b"\n")
-                with door.makefile("rb") as lines:
-                    told: dict[str, Any] = json.loads(lines.readline())
-        except (OSError, ValueError) as error:
+            return say(self._path, command)
+        except Unreachable as error:
             raise DistanceError(f"{self._path}: the virtual robot does not answer") from error
-        if not told.get("ok"):
-            raise DistanceError(f"{self._path}: {told.get('error')}")
-        return told
+        except InputError as error:
+            raise DistanceError(f"{self._path}: {error}") from error
 
 
 def _number(trial: str) -> int:

@@ -144,7 +144,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
         for name, process in list(self._processes.items()):
             if process.poll() is not None:
                 self._start(name)
-        with suppress(InputError):  # an agent that does not listen yet
+        with suppress(InputError):  # an agent or a robot that does not listen yet
             self._attend()
 
     def _attend(self) -> None:
@@ -152,7 +152,8 @@ class Laboratory(AbstractContextManager["Laboratory"]):
         if health["state"] in ("disabled", "stopped", "fault"):
             self._agent("enable")
         elif health["waiting"] == "cool":
-            self._hand(cmd="reset", draw=0)  # each walk begins with cold motors anyway
+            # By hand; each walk begins with cold motors anyway.
+            say(self._passing / "side", {"cmd": "reset", "draw": 0})
 
     def _open(self) -> None:
         shutil.rmtree(self.keys, ignore_errors=True)
@@ -236,14 +237,6 @@ class Laboratory(AbstractContextManager["Laboratory"]):
 
     def _agent(self, do: str) -> dict[str, Any]:
         return say(self._passing / "agent.sock", {"do": do})
-
-    def _hand(self, **command: Any) -> None:
-        """Do something at the side door of the robot."""
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as door:
-            door.settimeout(PATIENCE)
-            door.connect(str(self._passing / "side"))
-            door.sendall(json.dumps(command).encode() + b"\n")
-            door.recv(4096)
 
     def _end(self, name: str) -> None:
         process = self._processes.get(name)
