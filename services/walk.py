@@ -69,6 +69,8 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     bounds = read_bounds(shown.bounds or robot.identified_path, robot)
     _same_bounds(policy, bounds, shown)
     eta = None if shown.eta is None else _eta(policy, shown.eta)
+    if shown.landscape and not policy.card.shape.eta:
+        raise InputError(f"{shown.policy}: is conditioned on nothing; leave --landscape out")
     settings = TaskSettings(direction=Direction(policy.card.direction)).evaluation()
 
     def act(seen: NDArray[np.float32], mu: NDArray[np.float32]) -> Array:
@@ -120,8 +122,6 @@ def _write_landscape(
 ) -> None:
     """Distances over eta's box, where the projections of the bounds are; see docs/transfer.md."""
     card = policy.card
-    if not card.shape.eta:
-        raise InputError(f"{shown.policy}: is conditioned on nothing; leave --landscape out")
     points = qmc.Sobol(card.shape.eta, seed=shown.seed).random(shown.landscape)
     eta = qmc.scale(points, card.eta_lower, card.eta_upper)
     distance = landscape(policy.act, robot, bounds, settings, eta, DRAWS, shown.seed, threads)

@@ -75,6 +75,7 @@ def bundle(
     gait: Gait | None = None,
     parameters: Sequence[str] = ("a", "b", "c", "d"),
     lively: bool = False,
+    method: Method = Method.PUP,
 ) -> Path:
     """Write a policy that follows its reference.
 
@@ -83,10 +84,11 @@ def bundle(
       gait: the reference; None for the robot's own, which steps in place and falls soon.
       parameters: names of mu.
       lively: whether it departs from the reference by what it sees and by eta.
+      method: PUP or one without eta.
     """
     gait = gait or DARWIN.gait
     assert gait is not None
-    shape = PolicyShape.of(Method.PUP, len(OBSERVATION), len(parameters), len(DARWIN.joints))
+    shape = PolicyShape.of(method, len(OBSERVATION), len(parameters), len(DARWIN.joints))
     rng = np.random.default_rng(0)
     weights: dict[str, np.ndarray] = {
         "observations.count": np.array(1.0),
@@ -96,11 +98,14 @@ def bundle(
         "returns.mean": np.zeros(1),
         "returns.variance": np.ones(1),
     }
-    for name, sizes in (
-        ("actor", (shape.proprioception + shape.eta, *shape.hidden, shape.bins * shape.joints)),
-        ("projection", (shape.parameters, *shape.projection, shape.latent)),
-        ("critic", (shape.proprioception + shape.privileged, *shape.hidden, 1)),
-    ):
+    networks = {
+        "actor": (shape.proprioception + shape.eta, *shape.hidden, shape.bins * shape.joints),
+        "projection": (shape.parameters, *shape.projection, shape.latent),
+        "critic": (shape.proprioception + shape.privileged, *shape.hidden, 1),
+    }
+    if not shape.latent:
+        del networks["projection"]
+    for name, sizes in networks.items():
         for i, (inputs, outputs) in enumerate(pairwise(sizes)):
             spread = 0.2 if lively else 0.01
             weights[f"{name}.{2 * i}.weight"] = spread * rng.standard_normal((outputs, inputs))
@@ -112,15 +117,15 @@ def bundle(
         joints=DARWIN.joint_names,
         lower=tuple(j.lower for j in DARWIN.joints),
         upper=tuple(j.upper for j in DARWIN.joints),
-        method=Method.PUP,
+        method=method,
         direction="forward",
         shape=shape,
         observation=OBSERVATION,
         parameters=tuple(parameters),
         parameter_lower=(0.5,) * len(parameters),
         parameter_upper=(1.5,) * len(parameters),
-        eta_lower=(-1.0,) * 3,
-        eta_upper=(1.0,) * 3,
+        eta_lower=(-1.0,) * shape.eta,
+        eta_upper=(1.0,) * shape.eta,
         rates=(25.0, 33.0),
         reach=0.3,
         smoothing=5,

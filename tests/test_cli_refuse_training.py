@@ -1,19 +1,25 @@
 """The command line of training and walking: bad input ends with exit code 2, one clear line."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import agents
 import pytest
 from commandline import pup
 from refusals import Cases, Made, Place, assert_refused, check
 
+from pup.policy.bundle import read_bundle, write_bundle
+from pup.policy.shape import Method
 from pup.robot import RobotDescription
+from pup.sysid.result import read_bounds
 
 pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 
 case = Cases()
-IDENTIFIED = RobotDescription.load("darwin_op2").identified_path
+DARWIN = RobotDescription.load("darwin_op2")
+IDENTIFIED = DARWIN.identified_path
 
 
 def train(place: Place, *options: object) -> list[object]:
@@ -109,6 +115,17 @@ def _(place: Place) -> Made:
 @case("an eta that is none")
 def _(place: Place) -> Made:
     return walk(place, "--policy", place.here, "--eta", "a,b"), ("--eta", "'a,b'", "numbers")
+
+
+@case("a landscape over an eta that the policy has not")
+def _(place: Place) -> Made:
+    """Before it walks."""
+    bounds = read_bounds(IDENTIFIED, DARWIN)
+    folder = agents.bundle(place.here / "policy", parameters=bounds.names, method=Method.ROBUST)
+    card, weights = read_bundle(folder)
+    told = {"parameter_lower": bounds.lower.tolist(), "parameter_upper": bounds.upper.tolist()}
+    write_bundle(folder, replace(card, **told), weights)
+    return walk(place, "--policy", folder, "--landscape", 4), (folder, "leave --landscape out")
 
 
 @pytest.mark.parametrize("name", list(case))
