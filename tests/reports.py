@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,13 +67,13 @@ class Page(HTMLParser):
         return next(t for t in self.tables if t[0][0] == heading)
 
 
-def make_recording(robot: RobotDescription, name: str, **changes: object) -> Recording:
+def make_recording(robot: RobotDescription, name: str, **changes: Any) -> Recording:
     """Steps of 0.3 rad on every joint but the last of several, followed late."""
     step = np.where(np.arange(TICKS) >= 2, 0.3, 0.0)
     target = np.repeat(step[:, None], len(robot.joints), axis=1)
     target[:, 1:][:, -1:] = 0.0
     late = np.vstack([target[:1], target[:-1]])
-    fields: dict[str, object] = {
+    fields: dict[str, Any] = {
         "id": name,
         "robot": robot.name,
         "motion": "step",
@@ -83,7 +84,7 @@ def make_recording(robot: RobotDescription, name: str, **changes: object) -> Rec
         "target": target,
         "position": late,
     }
-    return Recording(**(fields | changes))  # type: ignore[arg-type]
+    return Recording(**(fields | changes))
 
 
 def tilt(pitch: float) -> dict[str, np.ndarray]:
@@ -151,3 +152,12 @@ def report(
     replays = {label: make_replay(loss, robot, off) for label, off in offsets.items()}
     write_report(folder / "report.html", bounds, robot, recordings, replays, loss)
     return Page(folder / "report.html")
+
+
+DARWIN = RobotDescription.load("darwin_op2")
+RECORDINGS = (
+    make_recording(DARWIN, "a"),
+    make_recording(DARWIN, "b"),
+    make_recording(DARWIN, "c", motion="fall", support="ground", extras=tilt(0.5)),
+)
+BOUNDS = make_bounds(DARWIN, RECORDINGS)

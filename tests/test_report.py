@@ -10,43 +10,17 @@ import matplotlib
 import numpy as np
 import pytest
 
-from pup.recording import Recording
-from pup.robot import RobotDescription
 from pup.sysid import wording
 from pup.sysid.html import tag
 from pup.sysid.loss import ReplayLoss
 from pup.sysid.overlays import write_overlays
-from pup.sysid.result import Bounds, SubsetFit
-from tests.reports import Page, make_bounds, make_recording, make_replay, report, tilt
+from pup.sysid.result import SubsetFit
+from tests.reports import BOUNDS, DARWIN, RECORDINGS, Page, make_recording, make_replay, report
 
 
 @pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return RobotDescription.load("darwin_op2")
-
-
-@pytest.fixture(scope="module")
-def recordings(robot: RobotDescription) -> tuple[Recording, ...]:
-    return (
-        make_recording(robot, "a"),
-        make_recording(robot, "b"),
-        make_recording(robot, "c", motion="fall", support="ground", extras=tilt(0.5)),
-    )
-
-
-@pytest.fixture(scope="module")
-def bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> Bounds:
-    return make_bounds(robot, recordings)
-
-
-@pytest.fixture(scope="module")
-def page(
-    tmp_path_factory: pytest.TempPathFactory,
-    bounds: Bounds,
-    robot: RobotDescription,
-    recordings: tuple[Recording, ...],
-) -> Page:
-    return report(tmp_path_factory.mktemp("report"), bounds, robot, recordings)
+def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return report(tmp_path_factory.mktemp("report"), BOUNDS, DARWIN, RECORDINGS)
 
 
 def test_needs_nothing_but_itself(page: Page) -> None:
@@ -105,20 +79,20 @@ def test_headline_tells_the_outcome(page: Page) -> None:
     assert "No split found" in page.text
 
 
-def test_table_holds_the_bounds(page: Page, bounds: Bounds) -> None:
+def test_table_holds_the_bounds(page: Page) -> None:
     table = page.table("Parameter")
-    assert len(table) == 1 + len(bounds.space)
+    assert len(table) == 1 + len(BOUNDS.space)
     for i, row in enumerate(table[1:]):
-        assert row[:2] == [bounds.space.names[i], bounds.space.units[i]]
+        assert row[:2] == [BOUNDS.space.names[i], BOUNDS.space.units[i]]
         told = [float(cell) for cell in row[2:5]] + [float(x) for x in row[5].split(" to ")]
-        expected = [bounds.nominal[i], bounds.lower[i], bounds.upper[i], *bounds.ci90[i]]
+        expected = [BOUNDS.nominal[i], BOUNDS.lower[i], BOUNDS.upper[i], *BOUNDS.ci90[i]]
         np.testing.assert_allclose(told, expected, rtol=6e-4)
 
 
-def test_unidentified_parameters_are_grey_and_say_so(page: Page, bounds: Bounds) -> None:
+def test_unidentified_parameters_are_grey_and_say_so(page: Page) -> None:
     table = page.table("Parameter")
     classes = page.row_classes[page.tables.index(table)]
-    for row, kind, known in zip(table[1:], classes[1:], bounds.identified, strict=True):
+    for row, kind, known in zip(table[1:], classes[1:], BOUNDS.identified, strict=True):
         assert (kind == "unknown") == (not known)
         assert row[6].startswith("yes" if known else "not identified by these recordings")
     assert table[1][6] == "yes; at the range's end"
@@ -140,11 +114,11 @@ def test_recordings_and_their_errors(page: Page) -> None:
     assert f"NN-PD {expected} mrad" in page.text
 
 
-def test_overlays_show_joints_and_torso(page: Page, robot: RobotDescription) -> None:
+def test_overlays_show_joints_and_torso(page: Page) -> None:
     for words in ("step of up to 0.3 rad, suspended (2 recordings)", "fall, ground (1 recording)"):
         assert words in page.text
-    assert f"Worst: {robot.joint_names[0]} in" in page.text
-    assert f"Best: {robot.joint_names[1]} in" in page.text
+    assert f"Worst: {DARWIN.joint_names[0]} in" in page.text
+    assert f"Best: {DARWIN.joint_names[1]} in" in page.text
     assert "torso roll in c" in page.text and "torso pitch in c" in page.text
     assert "no tilt to compare" not in page.text
 
@@ -160,36 +134,34 @@ def test_provenance_and_omissions(page: Page) -> None:
     assert "no standing recording: foot term left out" in page.text
 
 
-def test_same_bytes_and_settings_left_alone(
-    tmp_path: Path, bounds: Bounds, robot: RobotDescription, recordings: tuple[Recording, ...]
-) -> None:
+def test_same_bytes_and_settings_left_alone(tmp_path: Path) -> None:
     before = dict(matplotlib.rcParams)
-    first = report(tmp_path / "1", bounds, robot, recordings).source
-    second = report(tmp_path / "2", bounds, robot, recordings).source
+    first = report(tmp_path / "1", BOUNDS, DARWIN, RECORDINGS).source
+    second = report(tmp_path / "2", BOUNDS, DARWIN, RECORDINGS).source
     assert first == second
     assert dict(matplotlib.rcParams) == before
     assert [path.name for path in (tmp_path / "1").iterdir()] == ["report.html"]
 
 
-def test_hostile_text_stays_text(tmp_path: Path, bounds: Bounds, robot: RobotDescription) -> None:
+def test_hostile_text_stays_text(tmp_path: Path) -> None:
     evil = "</style><script>alert(1)</script><img src=http://x onerror='a()'>\x00\u202e & \ud800"
     recordings = (
-        make_recording(robot, 'a<b>&"$x^$', notes=evil, motion=evil),
-        make_recording(robot, "$x_{$'", support="ground", motion="stand"),
+        make_recording(DARWIN, 'a<b>&"$x^$', notes=evil, motion=evil),
+        make_recording(DARWIN, "$x_{$'", support="ground", motion="stand"),
     )
     bounds = replace(
-        bounds, robot="<b>", omitted=(evil,), provenance={evil: [evil, {"x": evil}], "n": None}
+        BOUNDS, robot="<b>", omitted=(evil,), provenance={evil: [evil, {"x": evil}], "n": None}
     )
-    page = report(tmp_path, bounds, robot, recordings, {"<i>authors</i>": 0.01})
+    page = report(tmp_path, bounds, DARWIN, recordings, {"<i>authors</i>": 0.01})
     assert not page.all("script") and not page.all("b") and not page.all("i")
     assert 'a<b>&"$x^$' in [row[0] for row in page.table("Recording")]
     assert "<script>alert(1)</script>" in page.text
     assert "\x00" not in page.source and "\u202e" not in page.source
     paths = write_overlays(
         tmp_path / "plots",
-        robot,
+        DARWIN,
         recordings,
-        make_replay(loss := ReplayLoss(robot, recordings), robot, 0.1),
+        make_replay(loss := ReplayLoss(DARWIN, recordings), DARWIN, 0.1),
         loss,
         "$",
     )
@@ -201,21 +173,19 @@ def test_elements_escape_all_but_markup() -> None:
     assert tag("img", alt="a") == '<img alt="a">'
 
 
-def test_single_recording_without_anything_else(
-    tmp_path: Path, bounds: Bounds, robot: RobotDescription
-) -> None:
+def test_single_recording_without_anything_else(tmp_path: Path) -> None:
     bare = replace(
-        bounds,
+        BOUNDS,
         held_out=None,
         subsets=(),
         splits=(),
         histories={},
         omitted=(),
         provenance={},
-        identified=np.zeros(len(bounds.space), dtype=bool),
-        correlation=np.eye(len(bounds.space)),
+        identified=np.zeros(len(BOUNDS.space), dtype=bool),
+        correlation=np.eye(len(BOUNDS.space)),
     )
-    page = report(tmp_path, bare, robot, (make_recording(robot, "only"),), {"PD": 0.02})
+    page = report(tmp_path, bare, DARWIN, (make_recording(DARWIN, "only"),), {"PD": 0.02})
     for words in (
         "1 recording (1 suspended)",
         "no recording was left out",
@@ -230,25 +200,23 @@ def test_single_recording_without_anything_else(
         assert words in page.text
 
 
-def test_ground_without_imu(tmp_path: Path, bounds: Bounds, robot: RobotDescription) -> None:
-    recordings = (make_recording(robot, "a", support="ground", motion="stand"),)
-    page = report(tmp_path, bounds, robot, recordings)
+def test_ground_without_imu(tmp_path: Path) -> None:
+    recordings = (make_recording(DARWIN, "a", support="ground", motion="stand"),)
+    page = report(tmp_path, BOUNDS, DARWIN, recordings)
     assert "no tilt to compare" in page.text
     assert "torso pitch in" not in page.text
 
 
-def test_split_is_told_with_its_meaning(
-    tmp_path: Path, bounds: Bounds, robot: RobotDescription, recordings: tuple[Recording, ...]
-) -> None:
-    splits = list(bounds.splits)
-    at = bounds.space.names.index("torque_limit")
+def test_split_is_told_with_its_meaning(tmp_path: Path) -> None:
+    splits = list(BOUNDS.splits)
+    at = BOUNDS.space.names.index("torque_limit")
     splits[at] = replace(splits[at], p_value=0.0004, two_clusters=0.0005)
     splits[1] = replace(splits[1], p_value=0.03)  # rho/head, not identified
     splits[2] = replace(splits[2], two_clusters=0.0005)
-    friction = bounds.space.names.index("ground_friction")
-    stuck = np.full(4, bounds.nominal[friction])
+    friction = BOUNDS.space.names.index("ground_friction")
+    stuck = np.full(4, BOUNDS.nominal[friction])
     splits[friction] = replace(splits[friction], without=stuck, p_value=0.001, two_clusters=0.001)
-    page = report(tmp_path, replace(bounds, splits=tuple(splits)), robot, recordings)
+    page = report(tmp_path, replace(BOUNDS, splits=tuple(splits)), DARWIN, RECORDINGS)
     assert (
         "rho/head (p = 0.0300) and torque_limit (p = 0.0004) take other values with ground contact"
         in page.text
@@ -284,18 +252,16 @@ def test_split_is_told_with_its_meaning(
     ],
 )
 def test_why_there_is_no_test(
-    bounds: Bounds,
-    robot: RobotDescription,
     supports: tuple[str, ...],
     contact: tuple[bool, ...],
     reason: str,
 ) -> None:
-    recordings = [make_recording(robot, f"r{i}", support=s) for i, s in enumerate(supports)]
-    values = bounds.nominal
+    recordings = [make_recording(DARWIN, f"r{i}", support=s) for i, s in enumerate(supports)]
+    values = BOUNDS.nominal
     untested = replace(
-        bounds,
+        BOUNDS,
         subsets=tuple(SubsetFit(("r0",), c, 1.0, values) for c in contact),
-        splits=tuple(replace(s, p_value=float("nan")) for s in bounds.splits),
+        splits=tuple(replace(s, p_value=float("nan")) for s in BOUNDS.splits),
     )
     told = wording.split_words(untested, recordings)
     assert told.startswith("Could not be tested because ") and reason in told

@@ -7,49 +7,37 @@ import pytest
 
 from pup.physics.parameters import robot_space
 from pup.physics.simulator import Trajectories, tick_slices
-from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits, accuracy
 from pup.sysid.loss import LOST_POSITION, ReplayLoss
 from pup.sysid.overlays import Overlays, by_motion, write_overlays
 from pup.sysid.report import write_report
 from pup.sysid.result import Bounds
-from tests.reports import ROLL, TICKS, Page, make_bounds, make_recording, make_replay, tilt
+from tests.reports import (
+    BOUNDS,
+    DARWIN,
+    RECORDINGS,
+    ROLL,
+    TICKS,
+    Page,
+    make_recording,
+    make_replay,
+    tilt,
+)
 
 
-@pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return RobotDescription.load("darwin_op2")
-
-
-@pytest.fixture(scope="module")
-def recordings(robot: RobotDescription) -> tuple[Recording, ...]:
-    return (
-        make_recording(robot, "a"),
-        make_recording(robot, "b"),
-        make_recording(robot, "c", motion="fall", support="ground", extras=tilt(0.5)),
-    )
-
-
-@pytest.fixture(scope="module")
-def bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> Bounds:
-    return make_bounds(robot, recordings)
-
-
-def test_gaps_and_broken_simulations(
-    tmp_path: Path, bounds: Bounds, robot: RobotDescription
-) -> None:
-    position = np.zeros((TICKS, len(robot.joints)))
+def test_gaps_and_broken_simulations(tmp_path: Path) -> None:
+    position = np.zeros((TICKS, len(DARWIN.joints)))
     position[4:, 3] = np.nan
     target = np.ones_like(position)
     target[1::2] = np.nan
     roll = {"imu/roll": np.zeros(TICKS)}
     recordings = (
-        make_recording(robot, "a", position=position, target=target),
-        make_recording(robot, "b", support="ground", extras=roll),
+        make_recording(DARWIN, "a", position=position, target=target),
+        make_recording(DARWIN, "b", support="ground", extras=roll),
     )
-    loss = ReplayLoss(robot, recordings)
-    replay = make_replay(loss, robot, 0.01)
+    loss = ReplayLoss(DARWIN, recordings)
+    replay = make_replay(loss, DARWIN, 0.01)
     replay.position[0, 6:TICKS] = np.nan
     measures = accuracy(loss, replay)
     assert measures.diverged.tolist() == [True, False]
@@ -57,19 +45,19 @@ def test_gaps_and_broken_simulations(
     expected = np.sqrt((6 * 0.01**2 + 6 * LOST_POSITION**2) / 12)
     assert measures.cells[0, 4] == pytest.approx(expected)
     np.testing.assert_allclose(measures.tilt, [[np.nan, np.nan], [0.01, np.nan]])
-    write_report(tmp_path / "r.html", bounds, robot, recordings, {"NN-PD": replay}, loss)
+    write_report(tmp_path / "r.html", BOUNDS, DARWIN, recordings, {"NN-PD": replay}, loss)
     page = Page(tmp_path / "r.html")
     assert page.table("Recording")[1][1].endswith("(broke down)")
     assert "torso roll in b" in page.text and "torso pitch" not in page.text
-    assert len(write_overlays(tmp_path / "plots", robot, recordings, replay, loss)) == 2
+    assert len(write_overlays(tmp_path / "plots", DARWIN, recordings, replay, loss)) == 2
 
 
-def test_accuracy_weighs_every_recording_the_same(robot: RobotDescription) -> None:
-    long = make_recording(robot, "a", support="ground", extras=tilt(0.0) | {"imu/roll": ROLL})
+def test_accuracy_weighs_every_recording_the_same() -> None:
+    long = make_recording(DARWIN, "a", support="ground", extras=tilt(0.0) | {"imu/roll": ROLL})
     short = make_recording(
-        robot, "b", time=long.time[:3], target=long.target[:3], position=long.position[:3]
+        DARWIN, "b", time=long.time[:3], target=long.target[:3], position=long.position[:3]
     )
-    loss = ReplayLoss(robot, (long, short))
+    loss = ReplayLoss(DARWIN, (long, short))
     position = loss.position[None].copy()
     position[:, loss.ticks[1]] += 0.1
     shape = position.shape[:2]
@@ -83,20 +71,20 @@ def test_accuracy_weighs_every_recording_the_same(robot: RobotDescription) -> No
     np.testing.assert_allclose(measures.tilt, [[around, 3.1], [np.nan, np.nan]])
 
 
-def test_joints_told_to_stay_are_shown_only_as_the_worst(robot: RobotDescription) -> None:
-    recordings = (make_recording(robot, "a"), make_recording(robot, "b"))
-    loss = ReplayLoss(robot, recordings)
-    still = len(robot.joints) - 1
+def test_joints_told_to_stay_are_shown_only_as_the_worst() -> None:
+    recordings = (make_recording(DARWIN, "a"), make_recording(DARWIN, "b"))
+    loss = ReplayLoss(DARWIN, recordings)
+    still = len(DARWIN.joints) - 1
 
     def shown(off: float) -> list[tuple[str, str]]:
-        replay = make_replay(loss, robot, 0.01)
+        replay = make_replay(loss, DARWIN, 0.01)
         replay.position[..., still] = loss.position[:, still] + off
         measures = {"x": accuracy(loss, replay)}
-        units = JointUnits.of(robot, recordings)
-        overlays = Overlays(robot, loss, {"x": replay}, measures, units)
+        units = JointUnits.of(DARWIN, recordings)
+        overlays = Overlays(DARWIN, loss, {"x": replay}, measures, units)
         return [(p.rank, p.signal) for p in overlays.joint_panels([0, 1], "x")]
 
-    names = robot.joint_names
+    names = DARWIN.joint_names
     calm, wild = shown(0.0), shown(0.5)
     assert calm[0] == ("worst", names[0]) and calm[-1] == ("best", names[1])
     assert wild[0] == ("worst", names[still]) and wild[-1] == ("best", names[1])
@@ -116,13 +104,13 @@ def test_the_only_joint_is_shown_in_several_recordings() -> None:
     assert shown == [("worst", "c"), ("median", "d"), ("best", "b")]
 
 
-def test_recordings_are_grouped_by_motion_and_step(robot: RobotDescription) -> None:
-    small = make_recording(robot, "a").target / 3
+def test_recordings_are_grouped_by_motion_and_step() -> None:
+    small = make_recording(DARWIN, "a").target / 3
     recordings = [
-        make_recording(robot, "a"),
-        make_recording(robot, "b", target=small),
-        make_recording(robot, "c", motion="walk", support="ground"),
-        make_recording(robot, "d", target=np.ones_like(small)),
+        make_recording(DARWIN, "a"),
+        make_recording(DARWIN, "b", target=small),
+        make_recording(DARWIN, "c", motion="walk", support="ground"),
+        make_recording(DARWIN, "d", target=np.ones_like(small)),
     ]
     assert by_motion(recordings, "rad") == {
         "step, suspended (1 recording)": [3],
@@ -166,14 +154,12 @@ def test_sliding_joints_are_told_in_millimetres(tmp_path: Path) -> None:
     assert "12.3 mm" in page.text and "mrad" not in page.text and "°" not in page.text
 
 
-def test_overlays_are_one_picture_per_recording(
-    tmp_path: Path, robot: RobotDescription, recordings: tuple[Recording, ...]
-) -> None:
-    loss = ReplayLoss(robot, recordings)
-    replay = make_replay(loss, robot, 0.01)
-    paths = write_overlays(tmp_path, robot, recordings, replay, loss)
+def test_overlays_are_one_picture_per_recording(tmp_path: Path) -> None:
+    loss = ReplayLoss(DARWIN, RECORDINGS)
+    replay = make_replay(loss, DARWIN, 0.01)
+    paths = write_overlays(tmp_path, DARWIN, RECORDINGS, replay, loss)
     assert [path.name for path in paths] == ["a.png", "b.png", "c.png"]
     assert all(path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n") for path in paths)
     assert sorted(tmp_path.iterdir()) == sorted(paths)
-    again = write_overlays(tmp_path / "again", robot, recordings, replay, loss)
+    again = write_overlays(tmp_path / "again", DARWIN, RECORDINGS, replay, loss)
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in paths]
