@@ -54,7 +54,9 @@ def test_the_reference_is_the_authors_gait_behind_the_half_squat(shared: Path) -
     np.testing.assert_allclose(middle, (start + end) / 2, atol=1e-12)
 
 
-def test_targets_are_the_reference_plus_reach_times_the_mean_of_the_last_five_actions() -> None:
+def test_targets_are_the_reference_plus_reach_times_the_mean_of_the_last_five_actions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     task = walking()
     told = []
     step = task._simulations.step
@@ -63,7 +65,7 @@ def test_targets_are_the_reference_plus_reach_times_the_mean_of_the_last_five_ac
         told.append(target)
         return step(target, running)
 
-    task._simulations.step = kept  # type: ignore[assignment,method-assign]
+    monkeypatch.setattr(task._simulations, "step", kept)
     task.reset()
     rng, actions, times = np.random.default_rng(1), [], [np.zeros(4)]
     for _ in range(8):
@@ -231,27 +233,6 @@ def test_the_robot_stands_in_the_half_squat() -> None:
     assert (np.abs(step.distance) < 0.02).all()
     tilt = step.observation.proprioception[:, 40:42]
     np.testing.assert_allclose(tilt, [[0.0, 0.126 - 0.075]] * 2, atol=0.05)
-
-
-def test_a_simulation_that_breaks_down_ends_its_episode_and_no_other() -> None:
-    sound, broken = (walking(NOISY, n=4) for _ in range(2))
-    sound.reset(), broken.reset()
-    state = broken.state()
-    state["simulations/physics"][1, QVEL] = 1e9
-    state["simulations/physics"][2, QPOS.start + 9] = np.nan
-    broken.restore(state)
-    for i in range(3):
-        step, other = broken.step(idle(4)), sound.step(idle(4))
-        assert np.isfinite(step.observation.proprioception).all()
-        assert np.isfinite(step.reward).all() and np.isfinite(step.distance).all()
-        if i == 0:
-            np.testing.assert_array_equal(step.terminated, [False, True, True, False])
-            np.testing.assert_array_equal(step.reward[[0, 3]], other.reward[[0, 3]])
-            np.testing.assert_array_equal(
-                step.observation.proprioception[[0, 3]], other.observation.proprioception[[0, 3]]
-            )
-        else:
-            np.testing.assert_array_equal(step.live, [True, i > 1, i > 1, True])
 
 
 def test_readings_are_as_noisy_as_the_paper_says() -> None:

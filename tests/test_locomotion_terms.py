@@ -343,9 +343,12 @@ def test_a_term_that_cannot_act_is_refused_in_one_line(term: TermSpec, words: st
     assert "\n" not in str(refused.value)
 
 
-def test_a_simulation_that_breaks_down_spoils_no_other() -> None:
+@pytest.mark.parametrize("robot", [DARWIN, EVERYTHING], ids=["plain", "with all effects"])
+def test_a_simulation_that_breaks_down_ends_its_episode_and_spoils_no_other(
+    robot: RobotDescription,
+) -> None:
     """Nor itself, once it has started anew."""
-    sound, broken = (task_with(EVERYTHING, n=4) for _ in range(2))
+    sound, broken = (task_with(robot, n=4) for _ in range(2))
     sound.reset(), broken.reset()
     sound.step(idle(4)), broken.step(idle(4))
     state = broken.state()
@@ -357,6 +360,11 @@ def test_a_simulation_that_breaks_down_spoils_no_other() -> None:
         assert np.isfinite(step.observation.proprioception).all()
         assert np.isfinite(step.reward).all() and np.isfinite(step.distance).all()
         np.testing.assert_array_equal(step.terminated, [False, i == 0, i == 0, False])
+        np.testing.assert_array_equal(step.live, [True, i != 1, i != 1, True])
         np.testing.assert_array_equal(step.reward[[0, 3]], other.reward[[0, 3]])
+        if i == 0:  # later, other noise is drawn
+            np.testing.assert_array_equal(
+                step.observation.proprioception[[0, 3]], other.observation.proprioception[[0, 3]]
+            )
     for name, values in broken.state().items():
         assert not np.isnan(values.astype(float)).any(), name
