@@ -228,17 +228,23 @@ def stops(repeats: int, causes: str) -> dict[str, Any]:
                 if made.health()["state"] != "enabled":
                     others += 1  # this machine was too busy: it tripped by itself
                     continue
-                count, before = len(tap.offs), time.monotonic()
-                act(made)
-                wait(lambda n=count: len(tap.offs) > n, 10, made.log)  # type: ignore[misc]
+                seconds = _until_off(made, tap, act)
                 if _is_why(made, cause):
-                    took.append((tap.offs[count] - before) / PERIOD)
+                    took.append(seconds / PERIOD)
                 else:
                     others += 1
                 _mend(made)
             table[cause] = _row(took) | {"tripped_by_itself": others}
             print(cause, json.dumps(table[cause]), file=sys.stderr, flush=True)
     return table
+
+
+def _until_off(made: Lab, tap: Tap, act: Cause) -> float:
+    """Seconds from a cause to torque off on the bus."""
+    count, before = len(tap.offs), time.monotonic()
+    act(made)
+    wait(lambda: len(tap.offs) > count, 10, made.log)
+    return tap.offs[count] - before
 
 
 def _is_why(made: Lab, cause: str) -> bool:

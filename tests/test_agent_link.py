@@ -1,7 +1,7 @@
 """The link: known by its key, made anew when it is silent, unmoved by what is no message."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -45,7 +45,7 @@ def tended(made: Link, happened: Callable[[], object], seconds: float = 10.0) ->
 
 
 @pytest.fixture
-def gateway(tmp_path: Path):  # type: ignore[no-untyped-def]
+def gateway(tmp_path: Path) -> Iterator[Gateway]:
     made = Gateway(tmp_path)
     yield made
     made.close()

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -41,6 +42,23 @@ class PowerCutError(Exception):
     """The agent is killed here."""
 
 
+class Fragile(Journal):
+    """A journal whose power may go.
+
+    Attributes:
+      cut: entries until it does; None for never.
+    """
+
+    cut: int | None = None
+
+    def append(self, entry: dict[str, Any]) -> None:
+        if self.cut == 0:
+            raise PowerCutError
+        if self.cut is not None:
+            self.cut -= 1
+        super().append(entry)
+
+
 @dataclass
 class World:
     """An agent, a gateway and a link between them that does what it wants.
@@ -52,7 +70,6 @@ class World:
       outbox: messages under way to the gateway.
       inbox: to the agent.
       forbidden: trials that were cancelled before they moved.
-      cut: journal entries until the power goes; None for never.
     """
 
     folder: Path
@@ -63,27 +80,14 @@ class World:
     outbox: list[Body] = field(default_factory=list)
     inbox: list[Body] = field(default_factory=list)
     forbidden: set[tuple[str, int]] = field(default_factory=set)
-    cut: int | None = None
 
     def __post_init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
         """Power is back: everything but the journal is gone."""
-        journal = Journal(self.folder / "journal")
-        append = journal.append
-
-        def fragile(entry: dict[str, object]) -> None:
-            if self.cut == 0:
-                self.cut = None
-                raise PowerCutError
-            if self.cut is not None:
-                self.cut -= 1
-            append(entry)
-
-        self.cut = None
-        self.book = TrialBook(journal)
-        journal.append = fragile  # type: ignore[method-assign]
+        self.journal = Fragile(self.folder / "journal")
+        self.book = TrialBook(self.journal)
         self.moving: Assign | None = None
 
     def agent(self, body: Body) -> None:
@@ -184,7 +188,7 @@ def _do(world: World, kind: str, rng: random.Random) -> None:
     elif kind == "resend":
         world.outbox += world.book.owed
     elif kind == "cut":
-        world.cut = rng.randrange(4)
+        world.journal.cut = rng.randrange(4)
     else:
         {"move": world.move, "stand": world.stand, "restart": world.restart}[kind]()
 
@@ -204,7 +208,7 @@ def _pass(world: World, kind: str, up: bool, which: int) -> None:
 
 def _settle(world: World) -> None:
     """The link works again, for long enough."""
-    world.cut = None
+    world.journal.cut = None
     for _ in range(6):
         world.stand()
         if world.moving is None and world.book.running:

@@ -31,7 +31,12 @@ from manifests import (
 from services.arguments import parser
 from services.cli import main
 from services.gateway.app import application
+from services.gateway.conductor import Conductor
 from services.gateway.config import DATABASE_FILE, PREFIX, Config
+from services.gateway.fits import Fits
+from services.gateway.keys import Tokens
+from services.gateway.metrics import Metrics
+from services.gateway.store import Store
 
 IMAGE = re.compile(rf"pup-(gateway|cluster|agent):{re.escape(version('pup'))}(-cuda)?")
 USER = 1000
@@ -238,12 +243,9 @@ def test_probes_ask_what_the_gateway_answers() -> None:
 
 def routes() -> set[str]:
     """Paths of the gateway's web application."""
-    from services.gateway.conductor import Conductor
-    from services.gateway.metrics import Metrics
-
-    conductor = Conductor.__new__(Conductor)
-    conductor.metrics = Metrics()
-    app = application(None, None, conductor, None)  # type: ignore[arg-type]
+    store = Store("sqlite://")  # in memory
+    conductor = Conductor(store, Fits(), Metrics())
+    app = application(store, Tokens(Path("tokens.json")), conductor, None)
     return set(app.openapi()["paths"])
 
 

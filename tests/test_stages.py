@@ -125,7 +125,7 @@ def test_a_shipped_policy_is_started_from_where_the_bounds_are_of_its_parameters
 
     def start() -> Path | None:
         robot = RobotDescription.load(folder)
-        means = Means(None, None, None, None, print, 1)  # type: ignore[arg-type]
+        means = Means(None, None, None, None, print, 1)  # type: ignore[arg-type]  # no stage is run
         return _Job(robot, (), Mission(Options(), 1000, 0), out, means)._start()
 
     assert start() is None

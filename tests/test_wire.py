@@ -205,7 +205,7 @@ def test_what_would_be_refused_is_not_sent() -> None:
         replace(assign, eta=(math.nan,)),
         replace(assign, attempt=-1),
         replace(assign, study="x" * 5000),
-        wire.Stop(reason=None),  # type: ignore[arg-type]
+        wire.Stop(reason=None),  # type: ignore[arg-type]  # which is what is refused
         wire.RecordingChunk("r", 0, 1, bytes(wire.SIZE_LIMIT)),
         wire.Heartbeat(health={"a": object()}),
     ):

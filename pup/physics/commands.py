@@ -6,6 +6,7 @@ each in turn, not to their mean. Commands may come late, by a time of its own fo
 and joint, without any rounding to sub-steps.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -33,10 +34,19 @@ class Target:
     share: Array
 
 
-class _Held:
+class HeldCommands(ABC):
     """Commands, each held until the next, that may come late."""
 
     timestep: float | Array
+
+    @abstractmethod
+    def on_time(self, step: int | Array, running: int) -> Target:
+        """Targets that arrive at once, the same for all candidates.
+
+        Args:
+          step: the sub-step; where simulations have one each, shape (n_simulations, 1).
+          running: recordings that have not ended, the first ones.
+        """
 
     def late(self, step: int | Array, lateness: Array) -> Target:
         """Targets that arrive late.
@@ -52,12 +62,12 @@ class _Held:
         share = np.where(now == before, 1.0, np.clip(since, 0, 1))
         return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
 
+    @abstractmethod
     def _held_at(self, time: Array) -> tuple[Array, Array]:
         """What is held at some times, and since when."""
-        raise NotImplementedError
 
 
-class Commands(_Held):
+class Commands(HeldCommands):
     """The commands of some recordings, each held until its next.
 
     Args:
@@ -92,8 +102,8 @@ class Commands(_Held):
         self._share = np.where(changed.any(axis=2), np.clip(since, 0, 1), 1.0)
         self._changes = (self._share < 1).cumsum(axis=1)
 
-    def on_time(self, step: int, running: int) -> Target:
-        """Targets of the running recordings, the same for all candidates."""
+    def on_time(self, step: int | Array, running: int) -> Target:
+        """See HeldCommands; all recordings are at the same sub-step."""
         recordings = np.arange(running)
         now = self.held[recordings, self._row[step, :running], None]
         if not self._changes[step, running - 1]:
@@ -111,7 +121,7 @@ class Commands(_Held):
         return self.held[recordings, row, joints], self.time[recordings, row]
 
 
-class LiveCommands(_Held):
+class LiveCommands(HeldCommands):
     """Commands that are told as simulations go, one for all joints of each at a time.
 
     A command holds from the beginning of the sub-step before which it was told, which is half a
@@ -149,12 +159,12 @@ class LiveCommands(_Held):
         self.held[:, 0], self.told[:, 0] = target, ((step - 0.5) * self.timestep[:, 0])[:, 0]
         begin(self.held, target[:, None])
 
-    def on_time(self, step: Array, running: int) -> Target:
-        """The newest targets."""
+    def on_time(self, step: int | Array, running: int) -> Target:
+        """See HeldCommands; these are the newest, of all simulations."""
         return Target(self.held[:, 0], None, _ONE)
 
     def late(self, step: int | Array, lateness: Array) -> Target:
-        """See _Held; a command never comes before it is told."""
+        """See HeldCommands; a command never comes before it is told."""
         return super().late(np.asarray(step)[:, :, None], np.maximum(lateness, 0.0))
 
     def _held_at(self, time: Array) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ of these. Without any, this is the torque law alone.
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.commands import Commands, LiveCommands, Target
+from pup.physics.commands import HeldCommands, Target
 from pup.physics.limited import LimitedLaw
 from pup.physics.outfit import Outfit
 from pup.physics.terms.base import Drive, Flow, Term
@@ -32,7 +32,7 @@ class Servos:
     def __init__(
         self,
         outfit: Outfit,
-        commands: Commands | LiveCommands,
+        commands: HeldCommands,
         power: Array | None,
         delay: Array | None,
         candidates: int,
@@ -147,7 +147,7 @@ class Servos:
     def _target(self, step: int | Array, running: int, time: float | Array) -> Target:
         n = running * self.candidates
         if self.delay is None and not self.late:
-            target = self.commands.on_time(step, running)  # type: ignore[arg-type]
+            target = self.commands.on_time(step, running)
         else:
             lateness = 0.0 if self.delay is None else self.delay[:n]
             for term in self.late:
