@@ -26,6 +26,11 @@ def robot(to: Any, more: str = "", **options: Any) -> None:
     to.add_argument("--robot", help=f"{names}, or a robot's folder{more}", **options)
 
 
+def robot_or_darwin(verb: argparse.ArgumentParser) -> None:
+    """Which robot, where there is a usual one."""
+    robot(verb, default="darwin_op2", more="; default: %(default)s")
+
+
 def out(verb: argparse.ArgumentParser, what: str) -> None:
     """Where files go."""
     verb.add_argument(

@@ -1,0 +1,162 @@
+"""What can be written behind the verbs that make, read or explain recordings."""
+
+import argparse
+from pathlib import Path
+
+from services.options import (
+    actuator,
+    budget,
+    count,
+    knob,
+    number,
+    out,
+    place,
+    recordings,
+    robot,
+    seed,
+)
+
+
+def import_logs(verb: argparse.ArgumentParser) -> None:
+    """What is read, and what the logs do not tell."""
+    verb.add_argument(
+        "format", metavar="FORMAT", help="bam, csv, darwin-hardware, emps, mcap, npz or sage"
+    )
+    verb.add_argument(
+        "paths", type=Path, nargs="+", metavar="PATH", help="logs, or folders that hold some"
+    )
+    out(verb, "a Parquet file per recording")
+    told = verb.add_argument_group("what the logs do not tell; it wins over what they do")
+    named = told.add_mutually_exclusive_group()
+    robot(named, more="; the recordings must fit it")
+    named.add_argument("--robot-name", metavar="NAME", help="of a robot without a description")
+    told.add_argument("--motion", help="motion type, such as step, hold or walk")
+    told.add_argument("--support", choices=("suspended", "ground", "bench"))
+    told.add_argument("--source", choices=("hardware", "simulation", "unknown"))
+    told.add_argument(
+        "--setup",
+        type=knob,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KNOB=NUMBER",
+        help="what was knowingly changed on the robot, by its knobs",
+    )
+    told.add_argument("--notes", default="", metavar="TEXT", help="kept with the recordings")
+    told.add_argument(
+        "--joints", metavar="A,B,...", help="joint names in column order (npz without names)"
+    )
+    told.add_argument("--state-topic", metavar="TOPIC", help="of the readings (mcap)")
+    told.add_argument("--command-topic", metavar="TOPIC", help="of the commands (mcap)")
+
+
+def record(verb: argparse.ArgumentParser) -> None:
+    """What a virtual robot does."""
+    verb.add_argument(
+        "motions",
+        nargs="+",
+        metavar="MOTION",
+        help="step, standup, fall, hold, chirp or triangle; step:0.3 (rad), standup:2 (s) and "
+        "fall:left are single variants",
+    )
+    robot(verb, required=True)
+    out(verb, "a Parquet file per recording; it may hold no other recordings")
+    verb.add_argument("--virtual", action="store_true", help="on a simulated robot (required)")
+    seed(verb, "; also which robot it is")
+    actuator(verb)
+    verb.add_argument(
+        "--repeats", type=number(1, 100), default=1, metavar="N", help="of each motion; default: 1"
+    )
+    verb.add_argument("--noiseless", action="store_true", help="perfect sensors and clock")
+    verb.add_argument(
+        "--truth", type=Path, metavar="FILE", help="reveal the robot's parameters in this file"
+    )
+
+
+def presysid(verb: argparse.ArgumentParser) -> None:
+    """What is fitted."""
+    recordings(verb)
+    robot(verb, required=True)
+    out(verb, "bounds.json, report.html and checkpoints/")
+    budget(verb, generations=500, subset_generations=100)
+    place(verb)
+
+
+def diagnose(verb: argparse.ArgumentParser) -> None:
+    """What is explained."""
+    recordings(verb)
+    robot(verb, required=True)
+    out(verb, "diagnosis.json, report.html and corrected/, a robot with what was missing")
+    verb.add_argument(
+        "--rivals",
+        action="store_true",
+        help="also fit the paper's NN-PD and a residual network to the same recordings and judge "
+        "all by motions left out; takes longer and needs PyTorch (the extra `learn`)",
+    )
+    seed(verb)
+    place(verb)
+
+
+def blind(verb: argparse.ArgumentParser) -> None:
+    """The actions on sealed sets."""
+    actions = verb.add_subparsers(title="actions", required=True, dest="action", metavar="ACTION")
+    for name, told, fill in (
+        ("make", "make a sealed set", _blind_make),
+        ("run", "diagnose all cases of a set; run again, it resumes", _blind_run),
+        ("score", "score the verdicts on a set", _blind_score),
+    ):
+        action = actions.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
+        fill(action)
+        action.add_argument(
+            "--json",
+            action="store_true",
+            default=argparse.SUPPRESS,
+            help="print one JSON object last on standard output",
+        )
+
+
+def _blind_make(action: argparse.ArgumentParser) -> None:
+    for option, told in (("--robot", "with something missing"), ("--nulls", "without")):
+        action.add_argument(
+            option,
+            type=count,
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar="NAME=COUNT",
+            help=f"cases {told}, by robot",
+        )
+    action.add_argument(
+        "--seed", required=True, metavar="KEY", help="any text; it tells the key, so conceal it"
+    )
+    out(action, "the cases and commitment.json; it may hold nothing else")
+    action.add_argument(
+        "--key", type=Path, required=True, metavar="FILE", help="where the truth goes; conceal it"
+    )
+
+
+def _blind_run(action: argparse.ArgumentParser) -> None:
+    _paths(action, ("--set", "DIR", "folder of the set"))
+    out(action, "run.json and, for each case, what `pup diagnose` writes but the report")
+    action.add_argument(
+        "--limit",
+        type=number(1, 1_000_000),
+        metavar="N",
+        help="only the first N cases by their random ids; default: all",
+    )
+    place(action)
+
+
+def _blind_score(action: argparse.ArgumentParser) -> None:
+    _paths(
+        action,
+        ("--set", "DIR", "folder of the set"),
+        ("--key", "FILE", "its key, revealed"),
+        ("--diagnoses", "DIR", "what `pup blind run` wrote: a case_<id>/diagnosis.json each"),
+        ("--out", "FILE", "where the scores go, as JSON; a table goes beside it"),
+    )
+
+
+def _paths(action: argparse.ArgumentParser, *wanted: tuple[str, str, str]) -> None:
+    for option, metavar, told in wanted:
+        action.add_argument(option, type=Path, required=True, metavar=metavar, help=told)
