@@ -7,26 +7,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pup.errors import InputError
+from pup.transfer.steps import Choose, Finish, Suggest, Wait, Walk, next_step
 from pup.transfer.study import (
     HANDED_OUT,
     OPEN,
     TOLD,
-    Choose,
-    Finish,
     Purpose,
     Result,
     Study,
     StudySettings,
     StudyState,
-    Suggest,
     Ticket,
     Trial,
     TrialError,
     TrialState,
     Verdict,
-    Wait,
-    Walk,
-    next_step,
 )
 
 S = TrialState

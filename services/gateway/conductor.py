@@ -18,29 +18,25 @@ from functools import partial
 from typing import Any, Protocol
 
 from pup.transfer import orders
+from pup.transfer.steps import Choose, Finish, Step, Suggest, Wait, Walk, next_step
 from pup.transfer.study import (
     HANDED_OUT,
-    Choose,
-    Finish,
     Gate,
     Purpose,
     Result,
     Study,
     StudySettings,
     StudyState,
-    Suggest,
     Ticket,
     Trial,
     TrialError,
     TrialState,
     Verdict,
-    Wait,
-    Walk,
-    next_step,
 )
-from pup.wire import Accepted, Armed, Assign, Body, Cancel, Finished, Running, Stop
+from pup.wire import Accepted, Armed, Body, Cancel, Finished, Running, Stop
 from services.gateway import fits
 from services.gateway.agents import AgentView
+from services.gateway.assignment import assignment, place_of, unfit, waits_for
 from services.gateway.metrics import Metrics
 from services.gateway.records import Row
 from services.gateway.store import Change, Event, ReplacedError, Store
@@ -191,7 +187,7 @@ class Conductor:
 
     async def reported(self, agent: str, body: Accepted | Armed | Running) -> Verdict:
         """An agent took a trial on, or its robot moves."""
-        where = self._place(body.trial)
+        where = place_of(body.trial, self.studies)
         if where is None:
             return Verdict.UNKNOWN
         name, number = where
@@ -209,7 +205,7 @@ class Conductor:
 
     async def finished(self, agent: str, body: Finished) -> Verdict:
         """A trial ended; once this returns, it is stored and may be acknowledged."""
-        where = self._place(body.trial)
+        where = place_of(body.trial, self.studies)
         if where is None:
             event = Event("unknown", agent, detail=asdict(body))
             await self.store.log([event])
@@ -262,15 +258,7 @@ class Conductor:
 
     def waits_for(self, study: Study) -> str:
         """What the open trial of a study waits for, in words."""
-        trial = study.open
-        if trial is None or trial.state is not TrialState.REQUESTED:
-            return ""
-        if not trial.released:
-            return "an operator to release it"
-        unfit = self._unfit(study)
-        fit = [name for name, why in unfit.items() if why is None]
-        told = "; ".join(f"{name} {why}" for name, why in unfit.items())
-        return "" if fit else f"an agent: {told or 'none is known'}"
+        return waits_for(study, self.studies, self.agents)
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
@@ -279,29 +267,6 @@ class Conductor:
             self.metrics.studies.labels(state.value).set(states.count(state))
         for view in self.agents.values():
             self.metrics.agent(view)
-
-    def _place(self, trial: str) -> tuple[str, int] | None:
-        name, _, number = trial.rpartition("/")
-        study = self.studies.get(name)
-        if study is None or not number.isascii() or not number.isdecimal() or len(number) > 9:
-            return None
-        return (name, int(number)) if 1 <= int(number) <= len(study.trials) else None
-
-    def _unfit(self, study: Study) -> dict[str, str | None]:
-        """Why each agent that may take a study's trial cannot; None where it can."""
-        trials = (s.open for s in self.studies.values())
-        busy = {t.agent: t.id for t in trials if t and t.state in HANDED_OUT}
-        settings, wanted = study.settings, study.settings.agent
-        told: dict[str, str | None] = {}
-        for name in [wanted] if wanted else sorted(self.agents):
-            view = self.agents.get(name)
-            if view is None:
-                told[name] = "is not connected"
-            elif name in busy:
-                told[name] = f"is at {busy[name]}"
-            else:
-                told[name] = view.can_run(settings.robot, settings.policy)
-        return told
 
     async def _write(self, change: Change) -> None:
         """Store a change, then make it known."""
@@ -359,7 +324,8 @@ class Conductor:
             self._assign(study, trial)
 
     async def _hand_out(self, study: Study, trial: Trial) -> None:
-        agent = next((n for n, why in self._unfit(study).items() if why is None), None)
+        reasons = unfit(study, self.studies, self.agents)
+        agent = next((name for name, why in reasons.items() if why is None), None)
         if agent is None:
             return
         given = trial.assign(agent, study.fence + 1)
@@ -374,26 +340,10 @@ class Conductor:
         view = self.agents.get(trial.agent or "")
         if view is None or (trial.id, trial.attempt, trial.fence) in view.journal:
             return
-        same = (t for t in study.told if t.eta == trial.eta and t.result and t.result.recording)
-        first = next(same, None)
-        repeat_of = first.result.recording if first and first.result else None
         self._sent[trial.id] = time.monotonic()
-        settings = study.settings
-        self.send(
-            view.name,
-            Assign(
-                study.name,
-                trial.id,
-                trial.attempt,
-                trial.fence,
-                settings.policy,
-                trial.eta,
-                settings.horizon,
-                repeat_of,
-            ),
-        )
+        self.send(view.name, assignment(study, trial))
 
-    async def _step(self, study: Study, step: Any) -> None:
+    async def _step(self, study: Study, step: Step) -> None:
         match step:
             case Suggest():
                 with self.metrics.suggest.time():
