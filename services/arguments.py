@@ -5,7 +5,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from services.arguments_policies import replay, serve, train, transfer, virtual_robot
-from services.arguments_recordings import blind, diagnose, import_logs, presysid, record
+from services.arguments_recordings import blind, diagnose, export, import_logs, presysid, record
 from services.options import budget, number, out, place, robot_or_darwin
 
 
@@ -22,6 +22,7 @@ def parser() -> argparse.ArgumentParser:
     for name, told, fill in (
         ("run", "the whole job, stage by stage; run again, it resumes", _run),
         ("import", "turn other people's logs into recordings", import_logs),
+        ("export", "turn recordings, and replays of them, into other programs' files", export),
         ("record", "record scripted motions of a virtual robot", record),
         ("presysid", "fit a robot's parameters to recordings, with bounds", presysid),
         ("train", "train a policy that walks, within bounds; run again, it resumes", train),

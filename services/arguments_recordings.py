@@ -6,6 +6,7 @@ from pathlib import Path
 from services.options import (
     actuator,
     budget,
+    cores,
     count,
     knob,
     number,
@@ -48,6 +49,30 @@ def import_logs(verb: argparse.ArgumentParser) -> None:
     )
     told.add_argument("--state-topic", metavar="TOPIC", help="of the readings (mcap)")
     told.add_argument("--command-topic", metavar="TOPIC", help="of the commands (mcap)")
+
+
+def export(verb: argparse.ArgumentParser) -> None:
+    """What is read, in which format it is written, and what is simulated beside it."""
+    verb.add_argument(
+        "format", metavar="FORMAT", help="lerobot (LeRobotDataset v3), mcap (Foxglove), rrd (Rerun)"
+    )
+    recordings(verb)
+    out(verb, "a file per recording, or for lerobot one data set")
+    verb.add_argument(
+        "--fps",
+        type=number(1, 1000),
+        metavar="N",
+        help="frames per second (lerobot); default: what the recordings have",
+    )
+    replayed = verb.add_argument_group("beside each recording, its replay in simulation")
+    robot(replayed, more="; it is simulated, and drawn in rrd")
+    replayed.add_argument(
+        "--bounds",
+        type=Path,
+        metavar="FILE",
+        help="bounds.json whose nominal values are replayed; default: as of `pup replay`",
+    )
+    cores(replayed)
 
 
 def record(verb: argparse.ArgumentParser) -> None:

@@ -223,6 +223,17 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
         return {"recordings": [str(file) for file in write_recordings(read, out)]}
 
 
+def _export(options: argparse.Namespace) -> dict[str, Any]:
+    from services.export import export
+
+    if options.bounds and not options.robot:
+        raise InputError("--bounds needs --robot, which is simulated; give both or none")
+    robot = RobotDescription.load(options.robot) if options.robot else None
+    wanted = options.format, options.recordings, robot, options.bounds, options.fps
+    with _folder(options.out) as out:
+        return export(*wanted, out, places.cores(options))
+
+
 def _record(options: argparse.Namespace) -> dict[str, Any]:
     from pup.sysid.virtual import SensorNoise, record
 
@@ -371,6 +382,13 @@ def _show_life(shown: dict[str, Any]) -> None:
     print(f"{shown['robot']} lived for {shown['time']:.1f} s")
 
 
+def _show_files(shown: dict[str, Any]) -> None:
+    for path in shown["files"]:
+        print(path)
+    if shown.get("left_out"):
+        print(f"not in every recording, so left out: {', '.join(shown['left_out'])}")
+
+
 def _show_recordings(shown: dict[str, Any]) -> None:
     for path in shown["recordings"]:
         print(path)
@@ -379,6 +397,7 @@ def _show_recordings(shown: dict[str, Any]) -> None:
 VERBS = {
     "run": (_run, _show_job),
     "import": (_import, _show_recordings),
+    "export": (_export, _show_files),
     "record": (_record, _show_recordings),
     "presysid": (_presysid, _show_bounds),
     "train": (_train, _show_training),

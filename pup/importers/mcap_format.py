@@ -3,7 +3,8 @@
 ROS 2: one topic holds readings, another commands; both are joined by joint name. Times are the
 header stamps where all messages have one, else the log times. A NaN speed is a missing sample, as
 ROS writes it; efforts have no column in a recording. JSON: every message is a row whose keys are
-the columns of the contract; null or an absent key is a missing sample.
+the columns of the contract, `"position/l_knee"` or `"position": {"l_knee": ...}`; null or an absent
+key is a missing sample. What `pup export mcap` wrote tells all of the recording.
 
 Chunks are unpacked here and not by the `mcap` package, which bounds neither LZ4 nor Zstandard.
 """
@@ -16,7 +17,7 @@ from typing import Any
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
-from mcap.records import Channel, Chunk, Footer, Message, Schema
+from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
@@ -26,6 +27,7 @@ from pup.importers.common import (
     Array,
     ImportOptions,
     finite,
+    item,
     join,
     joint_columns,
     parse_json,
@@ -53,6 +55,8 @@ string frame_id
 )
 COMMAND_WORDS = ("command", "target", "goal", "desired")
 NANOSECOND = 1e-9
+METADATA, RECORDING = "pup.recording", "/recording"
+"""Of `pup export mcap`: the metadata record of a recording, and the topic of its rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,8 +76,10 @@ class Topic:
 
 def read(path: Path, options: ImportOptions) -> list[Recording]:
     """Read one log."""
-    topics = _topics(path)
+    topics, told = _topics(path)
     chosen = (options.state_topic, options.command_topic)
+    if told is not None and chosen == (None, None):
+        chosen = (RECORDING, None)
     for name in chosen:
         if name is not None and name not in topics:
             raise InputError(f"no topic {name!r} that can be read; there are {', '.join(topics)}")
@@ -88,7 +94,8 @@ def read(path: Path, options: ImportOptions) -> list[Recording]:
             f"topics {', '.join(topics) or 'none'}: need one of JSON rows, or two of JointState; "
             "choose with --state-topic and --command-topic"
         )
-    return [from_columns(options.metadata({"id": path.stem, "notes": notes}), columns)]
+    known = {"id": path.stem, "notes": notes} | (told or {})
+    return [from_columns(options.metadata(known), columns)]
 
 
 def _pick(topics: list[Topic], state: str | None, command: str | None) -> tuple[Topic, Topic]:
@@ -176,23 +183,35 @@ def _stamp(message: Any) -> int:
 
 def _table(topic: Topic) -> dict[str, Array]:
     names: dict[str, None] = {}
+    rows: list[dict[str, Any]] = []
     for row, (_, message) in enumerate(topic.messages):
         if not isinstance(message, dict):
             raise InputError(f"topic {topic.name!r}, message {row}: not a JSON object")
-        names |= dict.fromkeys(message)
-    if len(topic.messages) * len(names) > MAX_CELLS:
+        rows.append(_flat(message))
+        names |= dict.fromkeys(rows[-1])
+    if len(rows) * len(names) > MAX_CELLS:
         raise InputError(f"topic {topic.name!r}: more than {MAX_CELLS} numbers; cut the log")
     columns = {}
     for name in names:
-        values = [message.get(name) for _, message in topic.messages]
+        values = [message.get(name) for message in rows]
         present = [row for row, value in enumerate(values) if value is not None]
         columns[name] = np.full(len(values), np.nan)
         columns[name][present] = finite([values[row] for row in present], name, (len(present),))
     return columns
 
 
-def _topics(path: Path) -> dict[str, Topic]:
-    """The topics that can be read, by name."""
+def _flat(message: dict[str, Any]) -> dict[str, Any]:
+    """A row by columns, `position/l_knee` for `l_knee` of `position`."""
+    row: dict[str, Any] = {}
+    for name, value in message.items():
+        nested = isinstance(value, dict)
+        row |= {f"{name}/{part}": v for part, v in value.items()} if nested else {name: value}
+    return row
+
+
+def _topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any] | None]:
+    """The topics that can be read, by name, and what a log of `pup export` says of itself."""
+    told: dict[str, Any] | None = None
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     topics: dict[str, Topic] = {}
@@ -201,6 +220,8 @@ def _topics(path: Path) -> dict[str, Topic]:
         for record in _records(path):
             if isinstance(record, Schema):
                 schemas[record.id] = record
+            elif isinstance(record, Metadata) and record.name == METADATA:
+                told = _told(record)
             elif isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message):
@@ -221,11 +242,21 @@ def _topics(path: Path) -> dict[str, Topic]:
     except InputError:
         raise
     except Exception as error:  # damaged logs make the readers raise nearly anything
-        told = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(
-            f"not a whole MCAP file ({told}); `mcap recover` saves what a power loss left"
+            f"not a whole MCAP file ({reason}); `mcap recover` saves what a power loss left"
         ) from error
-    return topics
+    return topics, told
+
+
+def _told(record: Metadata) -> dict[str, Any]:
+    """What the log says of its recording; `from_columns` judges it."""
+    known = parse_json(record.metadata.get("json", "null"))
+    if item(known, "schema") != 1:
+        raise InputError(
+            f"metadata {METADATA!r}: schema is {known['schema']!r}; this version reads 1"
+        )
+    return dict(known)
 
 
 def _records(path: Path) -> Iterator[Any]:

@@ -168,8 +168,13 @@ def first_tilt(robot: RobotDescription, model: Model, recording: Recording) -> A
     roll, pitch = (
         _first_known(recording.extras.get(f"imu/{angle}")) for angle in ("roll", "pitch")
     )
-    if roll is None or pitch is None:
-        return np.full(4, np.nan)
+    return tilted(
+        robot, model, np.nan if roll is None else roll, np.nan if pitch is None else pitch
+    )
+
+
+def tilted(robot: RobotDescription, model: Model, roll: float, pitch: float) -> Array:
+    """The torso's orientation by readings of its IMU, rad, shape (4,); NaN where one is NaN."""
     quaternion = _from_roll_pitch(roll, pitch)
     if robot.imu_site is not None:
         quaternion = multiply(quaternion, model.compiled.site(robot.imu_site).quat * CONJUGATE)
