@@ -14,7 +14,7 @@ import logging
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import landscapes
 
 Array = NDArray[np.float64]
-Session = Iterator[tuple[Array, Array | None]]
+Session = Generator[tuple[Array, Array | None], Any, None]
 """Gives an eta to walk and the one it would keep by now; is sent the distance."""
 LOOKS = (10, 25)
 
@@ -134,7 +134,7 @@ def regrets(make: Callable[[int], Session], seed: int, noise: float, gap: float)
     walked: Any = None
     for walks in range(max(LOOKS) + 1):
         began = time.process_time()
-        asked, kept = session.send(walked)  # type: ignore[attr-defined]
+        asked, kept = session.send(walked)
         spent.append(time.process_time() - began)
         if walks in LOOKS:
             assert kept is not None

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
+from unittest.mock import patch
 
 import mujoco.batch
 import numpy as np
@@ -76,9 +77,9 @@ def _against_engine(
     }
 
 
-def _line(row: dict[str, object]) -> str:
+def _line(row: dict[str, Any]) -> str:
     wall, processor = (
-        "{median:.2f} ({lowest:.2f} to {highest:.2f})".format(**row[key])  # type: ignore[arg-type]
+        "{median:.2f} ({lowest:.2f} to {highest:.2f})".format(**row[key])
         for key in ("wall", "processor")
     )
     return (
@@ -123,11 +124,8 @@ def _bare_informed(
         torques.append((torque.copy(), damping.copy()))
         return torque, damping
 
-    Servos.torque = kept  # type: ignore[method-assign]
-    try:  # one thread: one batch
+    with patch.object(Servos, "torque", kept):  # one thread: one batch
         MujocoSimulator(robot, simulator.recordings, actuator).replay(candidates)
-    finally:
-        Servos.torque = usual  # type: ignore[method-assign]
     del torques[0]  # that of the start
     per_simulation = scaled(robot, candidates, group.setups)
     batch = mujoco.batch.Batch(group.model.compiled, len(per_simulation), simulator.threads)

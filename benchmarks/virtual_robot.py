@@ -39,7 +39,9 @@ def packet(id: int, instruction: int, *parameters: int) -> bytes:
     return b"\xff\xff" + inner + bytes([checksum(inner)])
 
 
-GOALS = [round(CENTRE + angle / TICK) for angle in ROBOT.gait.start]  # type: ignore[union-attr, arg-type]
+assert ROBOT.gait is not None and ROBOT.gait.start is not None
+START = np.array(ROBOT.gait.start)
+GOALS = [round(CENTRE + angle / TICK) for angle in START]
 WRITE = packet(
     0xFE, 0x83, 30, 2, *(b for i, g in zip(IDS, GOALS, strict=True) for b in (i, g & 255, g >> 8))
 )
@@ -119,7 +121,7 @@ def beside(robots: int) -> None:
     """Robots beside each other."""
     fleet = Fleet(ROBOT, range(robots))
     fleet.reset()
-    targets = np.tile(np.array(ROBOT.gait.start), (robots, 1))  # type: ignore[union-attr]
+    targets = np.tile(START, (robots, 1))
 
     def period() -> None:
         fleet.observe()

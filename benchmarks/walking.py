@@ -9,6 +9,7 @@ Beside them the task of a corrected robot, with four effects, goes through the s
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -131,10 +132,10 @@ def _calls(task: WalkingTask, actions: np.ndarray) -> list[Call]:
         calls.append(("step", tuple(np.copy(a) for a in given)))
         return step(*given)
 
-    simulations.start, simulations.step = kept_start, kept_step  # type: ignore[method-assign]
-    task.reset()
-    for action in actions:
-        task.step(action)
+    with patch.multiple(simulations, start=kept_start, step=kept_step):
+        task.reset()
+        for action in actions:
+            task.step(action)
     return calls
 
 
@@ -155,7 +156,7 @@ def _known_torques(simulations: Simulations, calls: list[Call]) -> Callable[[], 
             kept.append(tuple(a.copy() for a in answer))
             return answer
 
-        part.limited.torque = noted  # type: ignore[method-assign]
+        part.limited.torque = noted  # type: ignore[method-assign]  # the instance alone
     _go_through(simulations, calls)
 
     def rewind() -> None:

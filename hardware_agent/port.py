@@ -24,7 +24,7 @@ FAILURES = (OSError, termios.error)
 """What a port raises that was pulled; pyserial's exception is an OSError."""
 
 
-class Port(PortHandler):  # type: ignore[misc]
+class Port(PortHandler):  # type: ignore[misc]  # the SDK has no types
     """A port for the SDK whose waiting for an answer fits into a control period.
 
     The SDK's own waits at least 34 ms, which is more than a period, by a clock that can jump, and

@@ -7,6 +7,7 @@ decided here is in the journal before it is answered or acted upon.
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 from hardware_agent.journal import Journal
 from pup.wire import (
@@ -214,9 +215,18 @@ class TrialBook:
         else:
             yield Accepted(*key, trial.fence)
 
-    def _finish(self, key: Key, outcome: Outcome, reason: str, *more: object) -> None:
+    def _finish(
+        self,
+        key: Key,
+        outcome: Outcome,
+        reason: str,
+        distance: float | None = None,
+        time: float | None = None,
+        recording: str | None = None,
+        digest: str | None = None,
+    ) -> None:
         fence = self._trials[key].fence
-        finished = Finished(*key, fence, outcome, *_measures(more, reason))  # type: ignore[arg-type]
+        finished = Finished(*key, fence, outcome, distance, time, reason, recording, digest)
         self._record(key, replace(self._trials[key], finished=finished))
 
     def _record(self, key: Key, trial: Trial) -> None:
@@ -231,21 +241,21 @@ class TrialBook:
     def _write(self, event: Event, key: Key, **more: object) -> None:
         self._journal.append({"event": event, "trial": key[0], "attempt": key[1], **more})
 
-    def _replay(self, entry: dict[str, object]) -> None:
-        key = (str(entry["trial"]), int(entry["attempt"]))  # type: ignore[call-overload]
+    def _replay(self, entry: dict[str, Any]) -> None:
+        key = (str(entry["trial"]), int(entry["attempt"]))
         event = Event(str(entry["event"]))
         known = self._trials.get(key)
         if event is Event.ACCEPTED:
             told = entry["assign"]
-            assign = None if told is None else Assign(**(told | {"eta": tuple(told["eta"])}))  # type: ignore
+            assign = None if told is None else Assign(**(told | {"eta": tuple(told["eta"])}))
             running = known is not None and known.running
-            self._trials[key] = Trial(entry["fence"], assign, running)  # type: ignore[arg-type]
+            self._trials[key] = Trial(entry["fence"], assign, running)
             return
         assert known is not None
         if event is Event.RUNNING:
             self._trials[key] = replace(known, running=True)
         elif event is Event.FINISHED:
-            told = dict(entry["finished"])  # type: ignore[call-overload]
+            told = dict(entry["finished"])
             finished = Finished(**(told | {"state": Outcome(told["state"])}))
             self._trials[key] = replace(
                 known, fence=finished.fence, finished=finished, acknowledged=False
@@ -264,11 +274,6 @@ def _refenced(trial: Trial, assign: Assign) -> Trial:
         finished=finished,
         acknowledged=False,
     )
-
-
-def _measures(more: tuple[object, ...], reason: str) -> tuple[object, ...]:
-    distance, time, recording, digest = more or (None, None, None, None)
-    return distance, time, reason, recording, digest
 
 
 def _progress(trial: Trial) -> Progress:

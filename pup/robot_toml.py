@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from pup.errors import InputError
 
@@ -113,7 +113,7 @@ class Table:
             return default
         if not _is_number(value):
             raise self._wrong(key, value, "a finite number")
-        return float(value)  # type: ignore[arg-type]
+        return float(value)
 
     def integer(self, key: str) -> int | None:
         """Take a whole number that may be left out."""
@@ -180,7 +180,7 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(names)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:

@@ -18,7 +18,7 @@ from pup.diagnosis.rivals import Rivals, compare
 from pup.diagnosis.store import Store
 from pup.files import write_json
 from pup.physics.parameters import robot_space
-from pup.physics.terms import split_column
+from pup.physics.terms import Kind, split_column
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
@@ -148,15 +148,14 @@ def _write_corrected(found: Diagnosis, out: Path) -> str:
     """Write the robot as it was found to be; what is nominal stays as it was fitted."""
     fit = found.model.fit if found.model else found.nominal.fit
     values = {n: v for n, v in fit.values.items() if "@" not in n}
-    terms: dict[tuple[str, str, str], dict[str, float]] = {}
+    terms: dict[tuple[str, Kind, str], dict[str, float]] = {}
     for name, value in fit.values.items():
         told = split_column(name)
         if told is not None:
             effect, quantity, place = told
             terms.setdefault((effect, place.kind, place.name), {})[quantity] = value
     known = list(found.robot.terms) + [
-        TermSpec(effect, kind, name, given)  # type: ignore[arg-type]
-        for (effect, kind, name), given in terms.items()
+        TermSpec(effect, kind, name, given) for (effect, kind, name), given in terms.items()
     ]
     folder = out / CORRECTED
     write_corrected(found.robot, folder, values, known, "Corrected by `pup diagnose`.", "pd")

@@ -152,7 +152,7 @@ class RayRunner:
 
 
 def _actor() -> Any:
-    return FitActor.remote()  # type: ignore[attr-defined]
+    return FitActor.remote()  # type: ignore[attr-defined]  # Ray adds it
 
 
 def _result(reference: Any) -> FitResult:

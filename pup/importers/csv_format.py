@@ -33,7 +33,8 @@ def read(path: Path, options: ImportOptions) -> list[Recording]:
 def _header(metadata: object) -> dict[str, Any]:
     if item(metadata, "schema") != 1:
         raise InputError(f"line 1: schema is {item(metadata, 'schema')!r}; this version reads 1")
-    return dict(metadata)  # type: ignore[call-overload, no-any-return]
+    assert isinstance(metadata, dict)  # as `item` has seen
+    return metadata
 
 
 def _columns(lines: list[str], skipped: int) -> dict[str, Array]:

@@ -7,6 +7,7 @@ to act on; a reward for speed. What the paper leaves out is the authors' (see `T
 
 import json
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,17 +217,17 @@ class WalkingTask:
             **{f"simulations/{name}": a for name, a in self._simulations.state().items()},
         }
 
-    def restore(self, state: dict[str, NDArray[np.generic]]) -> None:
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take up a state of the same task; see `state`."""
         self.rng.bit_generator.state = json.loads(state["rng"].tobytes())
-        self._episodes = _Episodes(**{f.name: state[f"episodes/{f.name}"].copy() for f in _FIELDS})  # type: ignore[arg-type]
+        self._episodes = _Episodes(**{f.name: state[f"episodes/{f.name}"].copy() for f in _FIELDS})
         rows = np.arange(self.n)
         model = self._starts.model.compiled
         empty = np.tile(self._starts.qpos, (self.n, 1)), np.zeros((self.n, model.nv))
         self._put(rows, *empty)
         prefix = "simulations/"
         physics = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
-        self._simulations.restore(physics)  # type: ignore[arg-type]
+        self._simulations.restore(physics)
 
     def _blank(self) -> _Episodes:
         n, joints, parameters = self.n, len(self.joints), len(self.parameter_names)

@@ -87,7 +87,7 @@ def application(store: Store, tokens: Tokens, conductor: Conductor, link: Link |
         schemas.setdefault("Problem", problems.Problem.model_json_schema())
         return told
 
-    app.openapi = openapi  # type: ignore[method-assign]
+    app.openapi = openapi  # type: ignore[method-assign]  # as FastAPI wants it
     return app
 
 

@@ -138,7 +138,7 @@ class _Server(uvicorn.Server):
 
     def stop(self) -> None:
         """Take no more requests and end streams."""
-        self.config.app.state.stopping = True  # type: ignore[union-attr]
+        self.config.app.state.stopping = True  # type: ignore[union-attr]  # it is no name of one
         self.should_exit = True
 
     async def startup(self, sockets: Any = None) -> None:

@@ -7,7 +7,7 @@ word anywhere: a space without such columns is the nominal model.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +157,7 @@ class Place:
         kind, _, name = text.partition(":")
         if kind not in get_args(Kind):
             raise InputError(f"place {text!r}: {kind!r} is none of {', '.join(get_args(Kind))}")
-        return cls(kind, name)  # type: ignore[arg-type]
+        return cls(cast(Kind, kind), name)
 
     def joints(self, robot: RobotDescription) -> NDArray[np.int64]:
         """The joints of a joint, of a group, or of a whole robot or bus; none elsewhere."""
