@@ -60,5 +60,6 @@ def _reap(folder: str, owner: int) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray sends it to all processes of a stopped job
     sys.stdin.buffer.read()
     _reap(sys.argv[1], int(sys.argv[2]))
