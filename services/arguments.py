@@ -4,14 +4,17 @@ import argparse
 from importlib.metadata import version
 from pathlib import Path
 
+from services.arguments_jobs import jobs, submit
 from services.arguments_policies import replay, serve, train, transfer, virtual_robot
 from services.arguments_recordings import blind, diagnose, export, import_logs, presysid, record
 from services.options import budget, number, out, place, robot_or_darwin
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line; the verb ends up in `name`."""
-    whole = argparse.ArgumentParser(
+def parser(
+    kind: type[argparse.ArgumentParser] = argparse.ArgumentParser,
+) -> argparse.ArgumentParser:
+    """The whole command line, as a kind of parser; the verb ends up in `name`."""
+    whole = kind(
         prog="pup",
         description="From recordings of a legged robot to bounds of its parameters.",
         epilog="`pup VERB --help` tells the options of a verb. Exit codes: 0 done, 2 bad input, "
@@ -27,6 +30,8 @@ def parser() -> argparse.ArgumentParser:
         ("presysid", "fit a robot's parameters to recordings, with bounds", presysid),
         ("train", "train a policy that walks, within bounds; run again, it resumes", train),
         ("transfer", "find what walks furthest on a robot, by a running service", transfer),
+        ("submit", "run a verb as a job on the cluster of a running service", submit),
+        ("jobs", "list, watch, call off and fetch such jobs", jobs),
         ("serve", "run the service that robots and studies talk to, or make its keys", serve),
         ("replay", "simulate recordings and compare, or let a policy walk", replay),
         ("diagnose", "say what physics the simulator leaves out, and model it", diagnose),

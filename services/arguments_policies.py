@@ -12,6 +12,7 @@ from services.options import (
     robot,
     robot_or_darwin,
     seed,
+    service,
 )
 
 TRAINING = (
@@ -147,13 +148,7 @@ def transfer(verb: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for study.json; default: the current one",
     )
-    where = verb.add_argument_group("the service")
-    where.add_argument(
-        "--url", default="http://127.0.0.1:8470", help="of `pup serve`; default: %(default)s"
-    )
-    where.add_argument(
-        "--token-file", metavar="FILE", help="with an operator's token; default: PUP_TOKEN"
-    )
+    service(verb)
     study = verb.add_argument_group("the study, where it is made; defaults are the service's")
     for name, limits, kind, told in (
         ("--trials", (1, 1000), int, "walks until eta is chosen (25)"),

@@ -134,6 +134,23 @@ def _transfer(options: argparse.Namespace) -> dict[str, Any]:
         return transfer.transfer(wanted, out, lambda line: print(line, file=sys.stderr, flush=True))
 
 
+def _submit(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services.submit import submit
+
+    return submit(options)
+
+
+def _jobs(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services.submit import jobs
+
+    if options.action != "fetch":
+        return jobs(options)
+    with _folder(options.out):
+        return jobs(options)
+
+
 def _serve(options: argparse.Namespace) -> dict[str, Any]:
     _service()
     from services.gateway import verb
@@ -354,6 +371,12 @@ def _show_transfer(shown: dict[str, Any]) -> None:
     show(shown)
 
 
+def _show_cluster(shown: dict[str, Any]) -> None:
+    from services.submit import show
+
+    show(shown)
+
+
 def _show_service(shown: dict[str, Any]) -> None:
     from services.gateway.verb import show
 
@@ -402,6 +425,8 @@ VERBS = {
     "presysid": (_presysid, _show_bounds),
     "train": (_train, _show_training),
     "transfer": (_transfer, _show_transfer),
+    "submit": (_submit, _show_cluster),
+    "jobs": (_jobs, _show_cluster),
     "serve": (_serve, _show_service),
     "replay": (_replay, _show_replay),
     "diagnose": (_diagnose, _show_diagnosis),

@@ -121,6 +121,17 @@ def cores(to: Any) -> None:
     to.add_argument("--cores", type=number(1, 4096), metavar="N", help="cores to use; default: all")
 
 
+def service(verb: argparse.ArgumentParser) -> None:
+    """Whom to ask."""
+    where = verb.add_argument_group("the service")
+    where.add_argument(
+        "--url", default="http://127.0.0.1:8470", help="of `pup serve`; default: %(default)s"
+    )
+    where.add_argument(
+        "--token-file", metavar="FILE", help="with an operator's token; default: PUP_TOKEN"
+    )
+
+
 def number(low: float, high: float, kind: type = int) -> Callable[[str], Any]:
     """An argument type: a number within limits."""
     wanted = "a whole number" if kind is int else "a number"

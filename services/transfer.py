@@ -71,9 +71,10 @@ class Gateway:
         """The answer to a GET."""
         return self._ask("GET", path, params=query)
 
-    def post(self, path: str, body: Any) -> Any:
-        """The answer to a POST, which is carried out once."""
-        return self._ask("POST", path, json=body, headers={"Idempotency-Key": uuid.uuid4().hex})
+    def post(self, path: str, body: Any, key: str | None = None) -> Any:
+        """The answer to a POST, which is carried out once for each key."""
+        headers = {"Idempotency-Key": key or uuid.uuid4().hex}
+        return self._ask("POST", path, json=body, headers=headers)
 
     def all(self, path: str, of: str) -> list[Any]:
         """All pages of a list."""
@@ -89,7 +90,7 @@ class Gateway:
         while True:
             try:
                 answer = self.http.request(method, path, **options)
-                if answer.status_code < 500:
+                if answer.status_code < 500 or _is_problem(answer):
                     break
                 why = f"it answers {answer.status_code}"
             except httpx.HTTPError as error:
@@ -109,6 +110,12 @@ class Gateway:
             return answer.json()
         except ValueError as error:
             raise InputError(f"{self.url}: not a gateway of pup; its answer is no JSON") from error
+
+
+def _is_problem(answer: httpx.Response) -> bool:
+    """Whether the gateway itself says that it cannot; waiting would not help."""
+    kind = answer.headers.get("content-type", "")
+    return answer.status_code == 503 and kind == "application/problem+json"
 
 
 def _detail(answer: httpx.Response) -> str:

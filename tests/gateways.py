@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,14 @@ class Service:
     link_port: int
     tokens: dict[str, str]
     database: str = ""
+    more: dict[str, str] = field(default_factory=dict)
     process: subprocess.Popen[bytes] | None = None
 
     @classmethod
-    def make(cls, data: Path, database: str = "") -> "Service":
+    def make(cls, data: Path, database: str = "", **more: str) -> "Service":
         known = Tokens(data / "tokens.json")
         tokens = {role.name.lower(): known.create(role.name.lower(), role) for role in Role}
-        return cls(data, free_port(), free_port(), tokens, database)
+        return cls(data, free_port(), free_port(), tokens, database, more)
 
     @property
     def url(self) -> str:
@@ -56,6 +57,7 @@ class Service:
 
     def start(self) -> None:
         told = {"DATA": self.data, "PORT": self.port, "LINK": self.link, "DATABASE": self.database}
+        told |= self.more
         environment = os.environ | {f"PUP_{k}": str(v) for k, v in told.items() if v}
         with open(self.data / "log.jsonl", "ab") as log:
             self.process = subprocess.Popen(

@@ -32,6 +32,7 @@ from services.arguments import parser
 from services.cli import main
 from services.gateway.app import application
 from services.gateway.conductor import Conductor
+from services.gateway.dispatcher import Dispatcher
 from services.gateway.config import DATABASE_FILE, PREFIX, Config
 from services.gateway.fits import Fits
 from services.gateway.keys import Tokens
@@ -245,7 +246,8 @@ def routes() -> set[str]:
     """Paths of the gateway's web application."""
     store = Store("sqlite://")  # in memory
     conductor = Conductor(store, Fits(), Metrics())
-    app = application(store, Tokens(Path("tokens.json")), conductor, None)
+    jobs = Dispatcher(store, None, Path(), conductor.metrics, conductor.notify)
+    app = application(store, Tokens(Path("tokens.json")), conductor, jobs, None)
     return set(app.openapi()["paths"])
 
 

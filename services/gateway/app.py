@@ -1,9 +1,6 @@
 """The REST interface of CONTRACTS.md section 7, and what hangs together with it."""
 
-import asyncio
-import json
 import time
-from collections.abc import AsyncIterator
 from dataclasses import fields
 from functools import partial
 from importlib.metadata import version
@@ -17,9 +14,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pup.transfer import orders
 from pup.transfer.study import Study, StudySettings
-from services.gateway import names, pages, problems
+from services.gateway import job_routes, names, pages, problems
 from services.gateway.access import BODY_LIMIT, IdempotencyKey, IdempotentRoute, needs
+from services.gateway.answers import as_json, conductor_of, stream
 from services.gateway.conductor import Conductor
+from services.gateway.dispatcher import Dispatcher
 from services.gateway.keys import Role, Tokens, User
 from services.gateway.link import Link
 from services.gateway.metrics import Metrics
@@ -39,9 +38,6 @@ from services.gateway.shapes import (
 )
 from services.gateway.store import Store
 
-STREAM = 15.0
-"""Between two signs of life of a stream of events, s."""
-
 StudyName = Annotated[str, Path(pattern=names.WHOLE, description="Name of a study.")]
 AgentName = Annotated[str, Path(pattern=names.WHOLE, description="Name of an agent.")]
 Number = Annotated[int, Path(ge=1, le=10**9, description="Of a trial in its study, from 1.")]
@@ -55,25 +51,30 @@ WRITE = responses(400, 401, 403, 404, 409, 411, 413, 422)
 v1 = APIRouter(prefix="/v1", route_class=IdempotentRoute)
 
 
-def application(store: Store, tokens: Tokens, conductor: Conductor, link: Link | None) -> FastAPI:
+def application(
+    store: Store, tokens: Tokens, conductor: Conductor, dispatcher: Dispatcher, link: Link | None
+) -> FastAPI:
     """The web application of a gateway.
 
     Args:
       store: of what must not be forgotten.
       tokens: who may ask.
       conductor: of the studies.
+      dispatcher: of the jobs.
       link: to the agents; None where only the interface is wanted.
     """
     app = FastAPI(
         title="pup",
         version=version("pup"),
-        description="Transfer of policies to robots: studies, trials, agents.",
+        description="Jobs on a cluster; transfer of policies to robots: studies, trials, agents.",
         docs_url=None,  # its page loads scripts from elsewhere
         redoc_url=None,
     )
     app.state.store, app.state.tokens, app.state.locks = store, tokens, {}
-    app.state.conductor, app.state.link, app.state.stopping = conductor, link, False
+    app.state.conductor, app.state.dispatcher = conductor, dispatcher
+    app.state.link, app.state.stopping = link, False
     app.include_router(v1)
+    app.include_router(job_routes.router)
     app.include_router(_service())
     app.include_router(pages.router)
     app.mount("/static", StaticFiles(directory=pages.STATIC), name="static")
@@ -136,25 +137,15 @@ class _Guard:
         return None
 
 
-def _conductor(request: Request) -> Conductor:
-    conductor: Conductor = request.app.state.conductor
-    return conductor
-
-
-def _json(value: Any, status: int = 200, **headers: str) -> Response:
-    body = json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
-    return Response(body, status, headers, "application/json")
-
-
 @v1.get("/studies", response_model=StudyList, responses=READ)
 async def list_studies(
     request: Request, _: Viewer, limit: Limit = 100, after: After = ""
 ) -> Response:
     """Studies by name, a page at a time."""
-    studies = _conductor(request).studies
+    studies = conductor_of(request).studies
     names = sorted(name for name in studies if name > after)
     told = [study_document(studies[name]) for name in names[:limit]]
-    return _json({"studies": told, "next": names[limit - 1] if len(names) > limit else None})
+    return as_json({"studies": told, "next": names[limit - 1] if len(names) > limit else None})
 
 
 @v1.post(
@@ -171,17 +162,17 @@ async def create_study(
     told = {k: v for k, v in wanted.model_dump(mode="json").items() if k in known}
     settings = settings_of(told)
     simulated = wanted.simulated.checked(len(settings.lower)) if wanted.simulated else None
-    study, new = await _conductor(request).create(wanted.name, settings, simulated, user.name)
+    study, new = await conductor_of(request).create(wanted.name, settings, simulated, user.name)
     place = f"/v1/studies/{study.name}"
-    return _json(study_document(study), 201 if new else 200, Location=place)
+    return as_json(study_document(study), 201 if new else 200, Location=place)
 
 
 @v1.get("/studies/{study:name}", response_model=StudyShape, responses=READ)
 async def get_study(request: Request, _: Viewer, study: StudyName) -> Response:
     """One study."""
-    conductor = _conductor(request)
+    conductor = conductor_of(request)
     found = conductor.study(study)
-    return _json(study_document(found) | {"waits_for": conductor.waits_for(found)})
+    return as_json(study_document(found) | {"waits_for": conductor.waits_for(found)})
 
 
 @v1.get("/studies/{study:name}/trials", response_model=TrialList, responses=READ)
@@ -193,15 +184,15 @@ async def list_trials(
     after: Annotated[int, Query(ge=0, le=10**9)] = 0,
 ) -> Response:
     """Trials of a study by number."""
-    trials = _conductor(request).study(study).trials[after:]
+    trials = conductor_of(request).study(study).trials[after:]
     told = [trial_document(t) for t in trials[:limit]]
-    return _json({"trials": told, "next": after + limit if len(trials) > limit else None})
+    return as_json({"trials": told, "next": after + limit if len(trials) > limit else None})
 
 
 @v1.get("/studies/{study:name}/posterior", response_model=Posterior, responses=READ)
 async def get_posterior(request: Request, _: Viewer, study: StudyName) -> Response:
     """The Gaussian process: what would be chosen now, and slices through it."""
-    return _json(await _conductor(request).posterior(study))
+    return as_json(await conductor_of(request).posterior(study))
 
 
 @v1.get("/studies/{study:name}/history", response_model=EventList, responses=READ)
@@ -213,10 +204,10 @@ async def list_events(
     after: Annotated[int, Query(ge=0, le=2**53)] = 0,
 ) -> Response:
     """What happened and why: decisions with their reasons, reports, orders."""
-    _conductor(request).study(study)
+    conductor_of(request).study(study)
     store: Store = request.app.state.store
     told = await store.events(study, after, limit)
-    return _json({"events": told, "next": told[-1]["id"] if len(told) == limit else None})
+    return as_json({"events": told, "next": told[-1]["id"] if len(told) == limit else None})
 
 
 @v1.get(
@@ -226,8 +217,8 @@ async def list_events(
 )
 async def stream_study(request: Request, _: Viewer, study: StudyName) -> Response:
     """Server-sent events: one whenever the study changed, with its revision."""
-    _conductor(request).study(study)
-    return _stream(request, study)
+    conductor_of(request).study(study)
+    return stream(request, study)
 
 
 @v1.post("/studies/{study:name}:pause", response_model=StudyShape, responses=WRITE)
@@ -236,8 +227,8 @@ async def pause_study(
 ) -> Response:
     """Make no more trials; the one under way ends as it may."""
     order = partial(orders.pause, reason=f"{user.name}: {why.reason}")
-    return _json(
-        study_document(await _conductor(request).change(study, user.name, order, "paused"))
+    return as_json(
+        study_document(await conductor_of(request).change(study, user.name, order, "paused"))
     )
 
 
@@ -246,9 +237,9 @@ async def resume_study(
     request: Request, user: Operator, study: StudyName, key: IdempotencyKey = None
 ) -> Response:
     """Make trials again."""
-    conductor = _conductor(request)
+    conductor = conductor_of(request)
     told = await conductor.change(study, user.name, orders.resume, "resumed")
-    return _json(study_document(told))
+    return as_json(study_document(told))
 
 
 @v1.post(
@@ -259,7 +250,7 @@ async def release_trial(
 ) -> Response:
     """Let a trial go to the robot."""
     order = partial(orders.release, number=number)
-    told = await _conductor(request).change(study, user.name, order, "released")
+    told = await conductor_of(request).change(study, user.name, order, "released")
     return _trial(told, number)
 
 
@@ -276,7 +267,7 @@ async def retry_trial(
 ) -> Response:
     """Run an aborted or lost trial again; `attempt` is the number of the new attempt."""
     order = partial(orders.retry, number=number, attempt=wanted.attempt)
-    told = await _conductor(request).change(study, user.name, order, "retried")
+    told = await conductor_of(request).change(study, user.name, order, "retried")
     return _trial(told, number)
 
 
@@ -287,18 +278,18 @@ async def cancel_trial(
     request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
 ) -> Response:
     """Take a trial back, or ask its agent to stop it; the study pauses."""
-    return _trial(await _conductor(request).cancel(study, number, user.name), number)
+    return _trial(await conductor_of(request).cancel(study, number, user.name), number)
 
 
 def _trial(study: Study, number: int) -> Response:
-    return _json(trial_document(study.trial(number)))
+    return as_json(trial_document(study.trial(number)))
 
 
 @v1.get("/agents", response_model=AgentList, responses=responses(401, 403))
 async def list_agents(request: Request, _: Viewer) -> Response:
     """Agents that are let in, and how they are."""
-    agents = _conductor(request).agents
-    return _json({"agents": [agents[name].document() for name in sorted(agents)]})
+    agents = conductor_of(request).agents
+    return as_json({"agents": [agents[name].document() for name in sorted(agents)]})
 
 
 @v1.get(
@@ -308,7 +299,7 @@ async def list_agents(request: Request, _: Viewer) -> Response:
 )
 async def stream_agents(request: Request, _: Viewer) -> Response:
     """Server-sent events: one whenever an agent was heard, at most one a second."""
-    return _stream(request, "")
+    return stream(request, "")
 
 
 @v1.post("/agents/{agent:name}:stop", status_code=202, responses=WRITE)
@@ -316,23 +307,8 @@ async def stop_agent(
     request: Request, user: Operator, agent: AgentName, why: Reason, key: IdempotencyKey = None
 ) -> Response:
     """Emergency stop by message; the switch at the robot is faster."""
-    await _conductor(request).stop(agent, user.name, why.reason)
-    return _json({"stopped": agent}, 202)
-
-
-def _stream(request: Request, name: str) -> Response:
-    conductor = _conductor(request)
-
-    async def told() -> AsyncIterator[str]:
-        revision = conductor.revision[name]
-        yield f"retry: 2000\ndata: {revision}\n\n"
-        while not await request.is_disconnected() and not request.app.state.stopping:
-            now = await conductor.wait(name, revision, STREAM)
-            yield f"data: {now}\n\n" if now != revision else ": still here\n\n"
-            revision = now
-            await asyncio.sleep(0.5)  # a browser need not know sooner
-
-    return StreamingResponse(told(), media_type="text/event-stream")
+    await conductor_of(request).stop(agent, user.name, why.reason)
+    return as_json({"stopped": agent}, 202)
 
 
 def _service() -> APIRouter:
@@ -356,8 +332,9 @@ def _service() -> APIRouter:
     @router.get("/metrics", response_class=PlainTextResponse, responses=responses(401, 403))
     async def metrics(request: Request, _: Viewer) -> Response:
         """For Prometheus."""
-        conductor = _conductor(request)
+        conductor = conductor_of(request)
         conductor.measure()
+        request.app.state.dispatcher.measure()
         return Response(generate_latest(conductor.metrics.registry), 200, {}, CONTENT_TYPE_LATEST)
 
     return router

@@ -30,6 +30,9 @@ class Config:
       agents: folder of the agents' public keys; empty for `agents` in that of the CURVE keys.
       certificate: file with the certificate of TLS; empty for none.
       key: file with its secret key.
+      ray: URL of the dashboard of the Ray cluster that jobs run on; empty for no jobs.
+      ray_token: file with the token of its authentication; empty for what Ray itself reads.
+      shared: folder that the gateway and all nodes of that cluster have at the same path.
       log: least level that is logged, `debug`, `info`, `warning` or `error`.
     """
 
@@ -43,6 +46,9 @@ class Config:
     agents: str = ""
     certificate: str = ""
     key: str = ""
+    ray: str = ""
+    ray_token: str = ""
+    shared: str = ""
     log: str = "info"
 
     @classmethod
@@ -114,6 +120,12 @@ class Config:
             raise InputError(f"link: {config.link[:40]!r} is no address such as {Config.link}")
         if config.log not in ("debug", "info", "warning", "error"):
             raise InputError(f"log: {config.log[:40]!r}; use debug, info, warning or error")
+        if bool(config.ray) != bool(config.shared):
+            raise InputError("ray and shared belong together; give both or none")
+        if config.ray and not config.ray.startswith(("http://", "https://")):
+            raise InputError(f"ray: {config.ray[:60]!r} is no address such as http://ray-head:8265")
+        if config.shared and not Path(config.shared).is_absolute():
+            raise InputError(f"shared: {config.shared[:60]!r} is no absolute path")
         if bool(config.certificate) != bool(config.key):
             raise InputError("certificate and key belong together; give both or none")
         return config

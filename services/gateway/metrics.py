@@ -38,6 +38,14 @@ class Metrics:
             registry=self.registry,
         )
         self.studies = Gauge("pup_studies", "Studies, by state.", ["state"], registry=self.registry)
+        self.jobs = Gauge("pup_jobs", "Jobs, by state.", ["state"], registry=self.registry)
+        self.attempts = Counter(
+            "pup_job_attempts",
+            "Attempts at jobs that ended, by what became of the job.",
+            ["state"],
+            registry=self.registry,
+        )
+        self.ray = Gauge("pup_ray_up", "Whether the Ray cluster answers.", registry=self.registry)
         self.silence = Gauge(
             "pup_agent_heartbeat_age_seconds",
             "Since an agent was last heard.",

@@ -14,6 +14,7 @@ from starlette.routing import Match
 from pup.errors import InputError
 from pup.transfer.study import TrialError
 from services.gateway.conductor import UnknownError
+from services.gateway.dispatcher import NoJobsError
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +85,10 @@ def handle(app: FastAPI) -> None:
     @app.exception_handler(TrialError)
     async def of_trial(request: Request, error: TrialError) -> JSONResponse:
         return problem(409, str(error), request)
+
+    @app.exception_handler(NoJobsError)
+    async def of_jobs(request: Request, error: NoJobsError) -> JSONResponse:
+        return problem(503, str(error), request)
 
     @app.exception_handler(InputError)
     async def of_input(request: Request, error: InputError) -> JSONResponse:

@@ -13,6 +13,7 @@ from pup.transfer.study import (
     Trial,
     TrialState,
 )
+from services.gateway.jobs import Attempt, Job, JobState
 
 Row = dict[str, Any]
 
@@ -112,3 +113,20 @@ def study_document(study: Study) -> Row:
         "open": study.open.number if study.open else None,
         "settings": asdict(study.settings),
     }
+
+
+def job_row(job: Job) -> Row:
+    """The row of a job."""
+    return asdict(job) | {"arguments": list(job.arguments), "state": job.state.value}
+
+
+def job_of(row: Row) -> Job:
+    """The job of a row."""
+    attempts = tuple(Attempt(**attempt) for attempt in row["attempts"])
+    told = {"arguments": tuple(row["arguments"]), "state": JobState(row["state"])}
+    return Job(**row | told | {"attempts": attempts})
+
+
+def job_document(job: Job) -> Row:
+    """A job as the REST interface tells it."""
+    return asdict(job) | {"state": job.state.value}

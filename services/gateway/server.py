@@ -1,4 +1,4 @@
-"""`pup serve`: one process with the link to the agents, the studies and the web application."""
+"""`pup serve`: one process with the link to the agents, the studies, the jobs, the pages."""
 
 import asyncio
 import contextlib
@@ -7,6 +7,7 @@ import logging
 import signal
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -15,11 +16,13 @@ from pup.errors import InputError
 from services.gateway.app import application
 from services.gateway.conductor import Conductor
 from services.gateway.config import Config
+from services.gateway.dispatcher import Dispatcher
 from services.gateway.fits import Fits
 from services.gateway.keys import KeyRing, Tokens
 from services.gateway.link import Link
 from services.gateway.metrics import Metrics
-from services.gateway.store import Store
+from services.gateway.ray_jobs import RayJobs, token_of
+from services.gateway.store import ReplacedError, Store
 
 log = logging.getLogger(__name__)
 STANDARD = set(vars(logging.makeLogRecord({}))) | {"message", "taskName"}
@@ -54,7 +57,7 @@ def serve(config: Config) -> dict[str, Any]:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     logging.basicConfig(level=config.log.upper(), handlers=[handler], force=True)
-    for name in ("alembic", "zmq", "asyncio"):
+    for name in ("alembic", "zmq", "asyncio", "httpx", "httpcore"):
         logging.getLogger(name).setLevel("WARNING")
     config.data.mkdir(parents=True, exist_ok=True)
     tokens, ring = config.token_store, config.key_ring
@@ -68,13 +71,16 @@ def serve(config: Config) -> dict[str, Any]:
 
 
 async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
-    store, fits = Store(config.url), Fits()
-    conductor = Conductor(store, fits, Metrics())
+    ray = RayJobs(config.ray, token_of(config.ray_token)) if config.ray else None
+    store, fits, metrics = Store(config.url), Fits(), Metrics()
+    conductor = Conductor(store, fits, metrics)
+    dispatcher = Dispatcher(store, ray, Path(config.shared), metrics, conductor.notify)
     link = Link(config, ring, conductor)
     try:
         await conductor.load()
+        await dispatcher.load()
         link.start()
-        app = application(store, tokens, conductor, link)
+        app = application(store, tokens, conductor, dispatcher, link)
         server = _Server(
             uvicorn.Config(
                 app,
@@ -89,8 +95,12 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
                 limit_concurrency=1000,
             )
         )
-        await _until_stopped(config, conductor, link, server)
+        await _until_stopped(config, conductor, dispatcher, link, server)
+    except ReplacedError as error:
+        raise InputError(str(error)) from error
     finally:
+        if ray is not None:
+            await ray.close()
         link.close()
         fits.close()
         store.close()
@@ -100,12 +110,13 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
 
 
 async def _until_stopped(
-    config: Config, conductor: Conductor, link: Link, server: "_Server"
+    config: Config, conductor: Conductor, dispatcher: Dispatcher, link: Link, server: "_Server"
 ) -> None:
     works = [
         asyncio.create_task(act(), name=name)
         for name, act in (
             ("studies", conductor.run),
+            ("jobs", dispatcher.run),
             ("link", link.run),
             ("keys", link.watch),
             ("web", server.serve),

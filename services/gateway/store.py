@@ -20,7 +20,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pup.errors import InputError
 from pup.transfer.study import Study, Trial
-from services.gateway.records import Row, study_of, study_row, trial_row
+from services.gateway.jobs import Job
+from services.gateway.records import Row, job_of, job_row, study_of, study_row, trial_row
 
 T = TypeVar("T")
 ANSWERS_KEPT = 7 * 86400.0  # s
@@ -120,6 +121,27 @@ class Store:
     async def studies(self) -> list[tuple[Study, Row | None]]:
         """All studies with their simulated rollouts, oldest first."""
         return await self.run(self._studies)
+
+    async def write_job(self, job: Job, event: Event | None = None) -> None:
+        """Write a job, and what happened to it.
+
+        Raises:
+          ReplacedError: another gateway has taken over.
+        """
+
+        def write(connection: sa.Connection) -> None:
+            self._check(connection)
+            row = job_row(job)
+            self._put(connection, "jobs", {"id": row.pop("id")}, row)
+            self._log(connection, None, [event] if event else [])
+
+        await self.run(write)
+
+    async def jobs(self) -> list[Job]:
+        """All jobs, oldest first."""
+        table = self.tables["jobs"]
+        query = sa.select(table).order_by(table.c.created, table.c.id)
+        return await self.run(lambda c: [job_of(dict(r._mapping)) for r in c.execute(query)])
 
     async def events(self, study: str, after: int, limit: int) -> list[Row]:
         """What happened in a study, oldest first."""

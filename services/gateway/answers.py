@@ -1,0 +1,42 @@
+"""What routes answer with, and what they ask."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+from fastapi import Request
+from fastapi.responses import Response, StreamingResponse
+
+from services.gateway.conductor import Conductor
+
+STREAM = 15.0
+"""Between two signs of life of a stream of events, s."""
+
+
+def conductor_of(request: Request) -> Conductor:
+    """The studies of the gateway that was asked."""
+    conductor: Conductor = request.app.state.conductor
+    return conductor
+
+
+def as_json(value: Any, status: int = 200, **headers: str) -> Response:
+    """A JSON value as an answer."""
+    body = json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+    return Response(body, status, headers, "application/json")
+
+
+def stream(request: Request, name: str) -> Response:
+    """Server-sent events: one whenever what has this name changed, with its revision."""
+    conductor = conductor_of(request)
+
+    async def told() -> AsyncIterator[str]:
+        revision = conductor.revision[name]
+        yield f"retry: 2000\ndata: {revision}\n\n"
+        while not await request.is_disconnected() and not request.app.state.stopping:
+            now = await conductor.wait(name, revision, STREAM)
+            yield f"data: {now}\n\n" if now != revision else ": still here\n\n"
+            revision = now
+            await asyncio.sleep(0.5)  # a browser need not know sooner
+
+    return StreamingResponse(told(), media_type="text/event-stream")

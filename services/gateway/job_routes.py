@@ -1,0 +1,285 @@
+"""The REST interface of jobs: submit, watch, call off, fetch."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from itertools import islice
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, HTTPException, Path, Query, Request
+from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from pydantic import BaseModel, Field
+
+from services.gateway import names
+from services.gateway.access import IdempotencyKey, IdempotentRoute, needs
+from services.gateway.answers import as_json, stream
+from services.gateway.dispatcher import LIST, Dispatcher
+from services.gateway.jobs import Job, JobState
+from services.gateway.keys import Role, User
+from services.gateway.problems import responses
+from services.gateway.records import Row, job_document
+from services.gateway.shapes import Retry, Strict
+from services.job_arguments import COUNT, LENGTH, VERBS
+
+CHUNK = 2**16
+FOLLOW = 0.5
+"""Between two looks at the log of a job that runs, s."""
+ARTIFACTS = 10_000
+"""Artefacts of a job that are listed."""
+
+JobName = Annotated[str, Path(pattern=names.WHOLE, description="Id of a job.")]
+Viewer = Annotated[User, needs(Role.VIEWER)]
+Operator = Annotated[User, needs(Role.OPERATOR)]
+READ = responses(400, 401, 403, 404, 422)
+WRITE = responses(400, 401, 403, 404, 409, 411, 413, 422, 503)
+router = APIRouter(prefix="/v1", route_class=IdempotentRoute)
+
+
+class NewJob(Strict):
+    """A job to run: a verb of the command line and what stands behind it."""
+
+    verb: Literal[VERBS]  # type: ignore[valid-type]
+    arguments: Annotated[
+        list[Annotated[str, Field(max_length=LENGTH)]],
+        Field(max_length=COUNT, description="Paths are relative to the shared storage."),
+    ] = Field([])
+    cpus: Annotated[float, Field(gt=0, le=4096, allow_inf_nan=False)] = 1.0
+    gpus: Annotated[float, Field(ge=0, le=64, allow_inf_nan=False)] = 0.0
+    retries: Annotated[int, Field(ge=0, le=100)] = 3
+
+
+class AttemptShape(BaseModel):
+    """An attempt; times are seconds since 1970."""
+
+    number: int
+    asked: float
+    known: bool
+    started: float | None
+    ended: float | None
+    outcome: str
+
+
+class JobShape(BaseModel):
+    """A job."""
+
+    id: str
+    verb: str
+    arguments: list[str]
+    who: str
+    created: float
+    cpus: float
+    gpus: float
+    retries: int
+    state: JobState
+    reason: str
+    cancelled_by: str
+    failures: int
+    attempts: list[AttemptShape]
+    waits_for: str
+    progress: str
+
+
+class JobList(BaseModel):
+    """A page of jobs, newest first; `next` goes on where it is given as `after`."""
+
+    jobs: list[JobShape]
+    next: str | None
+
+
+class ArtifactShape(BaseModel):
+    """A file that a job wrote; its SHA-256 once the job is done."""
+
+    name: str
+    bytes: int
+    modified: float
+    sha256: str | None
+
+
+class ArtifactList(BaseModel):
+    """What a job wrote."""
+
+    artifacts: list[ArtifactShape]
+
+
+def dispatcher_of(request: Request) -> Dispatcher:
+    """The jobs of the gateway that was asked."""
+    dispatcher: Dispatcher = request.app.state.dispatcher
+    return dispatcher
+
+
+async def document(dispatcher: Dispatcher, job: Job) -> Row:
+    """A job as it is told, with what it waits for and the last line that it said."""
+    folder = dispatcher.folder(job.id)
+    progress = await asyncio.to_thread(folder.last_line)
+    return job_document(job) | {"waits_for": dispatcher.waits_for(job), "progress": progress}
+
+
+async def artifacts(dispatcher: Dispatcher, job: Job) -> list[Row]:
+    """What a job wrote, by name."""
+
+    def listed() -> list[Row]:
+        folder = dispatcher.folder(job.id)
+        done = job.state is JobState.SUCCEEDED
+        outcome = folder.outcome(job.last.number) if done else None
+        digests = outcome.artifacts if outcome else {}
+        told = []
+        for name, path in islice(folder.files(), ARTIFACTS):
+            status = path.stat()
+            size, modified = status.st_size, status.st_mtime
+            row = {"name": name, "bytes": size, "modified": modified, "sha256": digests.get(name)}
+            told.append(row)
+        return told
+
+    return await asyncio.to_thread(listed)
+
+
+@router.get("/jobs", response_model=JobList, responses=READ)
+async def list_jobs(
+    request: Request,
+    _: Viewer,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    after: Annotated[str, Query(max_length=64, description="The last id of the page before.")] = "",
+    state: JobState | None = None,
+) -> Response:
+    """Jobs, newest first, a page at a time."""
+    dispatcher = dispatcher_of(request)
+    jobs = dispatcher.newest()
+    if after:
+        jobs = jobs[jobs.index(dispatcher.job(after)) + 1 :]
+    jobs = [job for job in jobs if state in (None, job.state)]
+    told = [await document(dispatcher, job) for job in jobs[:limit]]
+    return as_json({"jobs": told, "next": jobs[limit - 1].id if len(jobs) > limit else None})
+
+
+@router.post(
+    "/jobs",
+    status_code=201,
+    response_model=JobShape,
+    responses=WRITE | {200: {"description": "This key has a job already.", "model": JobShape}},
+)
+async def submit_job(
+    request: Request, user: Operator, wanted: NewJob, key: IdempotencyKey = None
+) -> Response:
+    """Run a verb on the cluster; the same key is one job, however often it is sent."""
+    dispatcher = dispatcher_of(request)
+    asked: dict[str, Any] = wanted.model_dump() | {"arguments": tuple(wanted.arguments)}
+    job, new = await dispatcher.submit(Job("", who=user.name, created=time.time(), **asked), key)
+    told = await document(dispatcher, job)
+    return as_json(told, 201 if new else 200, Location=f"/v1/jobs/{job.id}")
+
+
+@router.get("/jobs/{job:name}", response_model=JobShape, responses=READ)
+async def get_job(request: Request, _: Viewer, job: JobName) -> Response:
+    """One job."""
+    dispatcher = dispatcher_of(request)
+    return as_json(await document(dispatcher, dispatcher.job(job)))
+
+
+@router.post("/jobs/{job:name}:cancel", response_model=JobShape, responses=WRITE)
+async def cancel_job(
+    request: Request, user: Operator, job: JobName, key: IdempotencyKey = None
+) -> Response:
+    """Call a job off: its processes end, what they wrote stays. Operators do so with their own."""
+    dispatcher = dispatcher_of(request)
+    _may(user, dispatcher.job(job))
+    return as_json(await document(dispatcher, await dispatcher.cancel(job, user.name)))
+
+
+@router.post("/jobs/{job:name}:retry", response_model=JobShape, responses=WRITE)
+async def retry_job(
+    request: Request, user: Operator, job: JobName, wanted: Retry, key: IdempotencyKey = None
+) -> Response:
+    """Attempt a job again that ended without a result; it resumes from its checkpoints.
+
+    `attempt` is the number of the new attempt.
+    """
+    dispatcher = dispatcher_of(request)
+    _may(user, dispatcher.job(job))
+    again = await dispatcher.retry(job, wanted.attempt, user.name)
+    return as_json(await document(dispatcher, again))
+
+
+@router.get(
+    "/jobs/{job:name}/logs",
+    responses=READ | {200: {"content": {"text/plain": {}}}},
+    response_class=PlainTextResponse,
+)
+async def get_logs(
+    request: Request,
+    _: Viewer,
+    job: JobName,
+    offset: Annotated[int, Query(ge=0, le=2**53, description="First byte.")] = 0,
+    follow: Annotated[bool, Query(description="Until the job has ended.")] = False,
+) -> Response:
+    """What a job said, in all its attempts, from a byte on."""
+    dispatcher = dispatcher_of(request)
+    dispatcher.job(job)
+
+    async def told() -> AsyncIterator[bytes]:
+        at, path = offset, dispatcher.folder(job).log
+        while True:
+            over = not dispatcher.job(job).open
+            while chunk := await asyncio.to_thread(_read, path, at):
+                at += len(chunk)
+                yield chunk
+            if over or not follow or request.app.state.stopping:
+                return
+            await asyncio.sleep(FOLLOW)
+
+    return StreamingResponse(told(), media_type="text/plain; charset=utf-8")
+
+
+@router.get("/jobs/{job:name}/artifacts", response_model=ArtifactList, responses=READ)
+async def list_artifacts(request: Request, _: Viewer, job: JobName) -> Response:
+    """What a job wrote, by name."""
+    dispatcher = dispatcher_of(request)
+    return as_json({"artifacts": await artifacts(dispatcher, dispatcher.job(job))})
+
+
+@router.get(
+    "/jobs/{job:name}/artifacts/{name:path}",
+    responses=READ | {200: {"content": {"application/octet-stream": {}}}},
+    response_class=FileResponse,
+)
+async def get_artifact(request: Request, _: Viewer, job: JobName, name: str) -> Response:
+    """A file that a job wrote; ranges of bytes can be had."""
+    folder = dispatcher_of(request).folder(job)
+    path = await asyncio.to_thread(folder.file, name)
+    if path is None:
+        raise HTTPException(404, f"{job} has no artefact {name[:200]}")
+    return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+
+@router.get(
+    "/jobs/{job:name}/events",
+    responses=READ | {200: {"content": {"text/event-stream": {}}}},
+    response_class=StreamingResponse,
+)
+async def stream_job(request: Request, _: Viewer, job: JobName) -> Response:
+    """Server-sent events: one whenever the job changed or said something."""
+    dispatcher_of(request).job(job)
+    return stream(request, LIST + job)
+
+
+@router.get(
+    "/jobs/-/events",
+    responses=READ | {200: {"content": {"text/event-stream": {}}}},
+    response_class=StreamingResponse,
+)
+async def stream_jobs(request: Request, _: Viewer) -> Response:
+    """Server-sent events: one whenever a job changed."""
+    return stream(request, LIST)
+
+
+def _may(user: User, job: Job) -> None:
+    if user.role < Role.ADMIN and user.name != job.who:
+        raise HTTPException(403, f"{job.id} is {job.who}'s; the role admin is needed")
+
+
+def _read(path: Any, at: int) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            file.seek(at)
+            return file.read(CHUNK)
+    except FileNotFoundError:
+        return b""

@@ -1,0 +1,199 @@
+"""A job's folder in shared storage: where the gateway and the job's process meet.
+
+    <shared>/jobs/<job>/
+      order.json              what to run, which attempt may, whether to stop; the gateway's
+      claim-<attempt>         made by the process that runs an attempt: there is but one
+      beat.json               counted up by that process while it lives
+      log.txt                 what the verb said, in all attempts
+      outcome-<attempt>.json  how an attempt ended
+      out/                    the verb's own --out folder: the artefacts
+
+The gateway needs no answer of Ray to know how a job ended or to have it stopped, and an attempt
+that was given up is shut out: its process reads in order.json that another one has the folder.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+from pup.files import read_json, sha256, write_json
+
+SCHEMA = 1
+JOBS = "jobs"
+REVOKED = 75
+"""Exit code of a process whose attempt is another's, or was called off before it began."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a job's process shall do.
+
+    Attributes:
+      job: id.
+      attempt: that alone may run.
+      stop: nobody may.
+      fresh: what an earlier attempt left in `out` is in the way, not a checkpoint.
+      command: what stands behind `pup`.
+    """
+
+    job: str
+    attempt: int
+    stop: bool
+    fresh: bool
+    command: list[str]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt ended.
+
+    Attributes:
+      attempt: number.
+      exit: code of the verb; 128 and more where a signal ended it.
+      told: last line of its log.
+      artifacts: SHA-256 by name, of a verb that was done.
+    """
+
+    attempt: int
+    exit: int
+    told: str = ""
+    artifacts: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class JobFolder:
+    """A job's folder.
+
+    Attributes:
+      path: of it.
+    """
+
+    path: Path
+
+    @property
+    def shared(self) -> Path:
+        """Root of the shared storage."""
+        return self.path.parent.parent
+
+    @property
+    def out(self) -> Path:
+        """Where the verb writes."""
+        return self.path / "out"
+
+    @property
+    def log(self) -> Path:
+        """What it says."""
+        return self.path / "log.txt"
+
+    def write_order(self, order: Order) -> None:
+        """Tell the job's process what to do."""
+        write_json(self.path / "order.json", {"schema": SCHEMA} | asdict(order))
+
+    def order(self) -> Order:
+        """What to do.
+
+        Raises:
+          InputError: the file is absent or no order.
+        """
+        return Order(**_read(self.path / "order.json"))
+
+    def revoke(self) -> None:
+        """Have what runs stop, and nothing begin."""
+        with suppress(InputError):  # without an order nothing begins either
+            self.write_order(replace(self.order(), stop=True))
+
+    def claim(self, attempt: int) -> bool:
+        """Take an attempt; False where another process has it."""
+        try:
+            (self.path / f"claim-{attempt}").touch(exist_ok=False)
+        except FileExistsError:
+            return False
+        return True
+
+    def claimed(self, attempt: int) -> bool:
+        """Whether a process took the attempt."""
+        return (self.path / f"claim-{attempt}").exists()
+
+    def beat(self, attempt: int, count: int) -> None:
+        """Give a sign of life."""
+        write_json(self.path / "beat.json", {"schema": SCHEMA, "attempt": attempt, "count": count})
+
+    def heard(self) -> tuple[int, int] | None:
+        """Attempt and count of the last sign of life."""
+        try:
+            told = _read(self.path / "beat.json")
+        except InputError:
+            return None
+        return told["attempt"], told["count"]
+
+    def write_outcome(self, outcome: Outcome) -> None:
+        """Keep how an attempt ended."""
+        write_json(self._outcome(outcome.attempt), {"schema": SCHEMA} | asdict(outcome))
+
+    def outcome(self, attempt: int) -> Outcome | None:
+        """How an attempt ended; None while nothing is known."""
+        try:
+            return Outcome(**_read(self._outcome(attempt)))
+        except InputError:
+            return None
+
+    def files(self) -> Iterator[tuple[str, Path]]:
+        """Artefacts by name, sorted; links are none, nor are files that are being written."""
+        for folder, folders, files in os.walk(self.out):
+            folders.sort()
+            for name in sorted(files):
+                path = Path(folder) / name
+                if not name.startswith(".") and path.is_file() and not path.is_symlink():
+                    yield path.relative_to(self.out).as_posix(), path
+
+    def file(self, name: str) -> Path | None:
+        """An artefact by its name; None for whatever is none, such as a way out of the folder."""
+        parts = name.split("/")
+        if "\0" in name or "\\" in name or any(p in ("", ".", "..") for p in parts):
+            return None
+        path = self.out.joinpath(*parts)
+        inside = path.resolve().is_relative_to(self.out.resolve())
+        hidden = parts[-1].startswith(".")
+        return path if inside and not hidden and path.is_file() and not path.is_symlink() else None
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of the artefacts by name."""
+        return {name: sha256(path) for name, path in self.files()}
+
+    def last_line(self) -> str:
+        """The last line of the log, cut to what fits into a message."""
+        return (self.tail(2048).strip().splitlines() or [""])[-1][:500]
+
+    def log_size(self) -> int:
+        """Of the log, bytes."""
+        return self.log.stat().st_size if self.log.exists() else 0
+
+    def tail(self, size: int) -> str:
+        """The last bytes of the log as text, from the beginning of a line on."""
+        try:
+            with open(self.log, "rb") as file:
+                at = max(0, file.seek(0, os.SEEK_END) - size)
+                file.seek(at)
+                told = file.read(size).decode(errors="replace")
+        except OSError:
+            return ""
+        return told.partition("\n")[2] if at and "\n" in told else told
+
+    def _outcome(self, attempt: int) -> Path:
+        return self.path / f"outcome-{attempt}.json"
+
+
+def folder_of(shared: Path, job: str) -> JobFolder:
+    """The folder of a job."""
+    return JobFolder(shared / JOBS / job)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    told = read_json(path)
+    if not isinstance(told, dict) or told.pop("schema", None) != SCHEMA:
+        raise InputError(f"{path}: not of schema {SCHEMA}")
+    return told

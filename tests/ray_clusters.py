@@ -1,0 +1,136 @@
+"""Ray clusters for tests: `ray start` in processes of their own, with token authentication."""
+
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+from gateways import free_port
+
+MARK = "PUP_TEST_NODE"
+"""Environment variable that every process of a node has, those of its jobs too."""
+
+
+def marked(name: str) -> list[int]:
+    """Processes of a node."""
+    mark, found = f"{MARK}={name}".encode(), []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark in (process / "environ").read_bytes().split(b"\0"):
+                found.append(int(process.name))
+        except OSError:
+            continue
+    return found
+
+
+def commands(words: str) -> list[int]:
+    """Processes whose command line has these words."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            line = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue
+        if words in line and int(process.name) != os.getpid():
+            found.append(int(process.name))
+    return found
+
+
+@dataclass
+class RayCluster:
+    """A head without work and workers, each of which can be killed as a whole."""
+
+    folder: Path
+    token: str = field(default_factory=lambda: secrets.token_hex(16))
+    name: str = field(default_factory=lambda: secrets.token_hex(6))
+    gcs: int = field(default_factory=free_port)
+    dashboard: int = field(default_factory=free_port)
+    nodes: list[str] = field(default_factory=list)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.dashboard}"
+
+    @property
+    def temp(self) -> Path:
+        return Path("/tmp") / f"pup-{self.name}"  # sockets need short paths
+
+    def start_head(self) -> None:
+        more = (f"--port={self.gcs}", f"--dashboard-port={self.dashboard}", "--num-cpus=0")
+        self._start("head", "--head", "--include-dashboard=true", *more)
+        for _ in range(600):
+            try:
+                headers = {"Authorization": f"Bearer {self.token}"}
+                if httpx.get(f"{self.url}/api/jobs/", headers=headers).status_code == 200:
+                    return
+            except httpx.HTTPError:
+                pass
+            time.sleep(0.2)
+        raise AssertionError(f"Ray does not start: {self._log('head').read_text()}")
+
+    def start_worker(self, number: int, cpus: int = 1) -> None:
+        address = f"--address=127.0.0.1:{self.gcs}"
+        self._start(f"worker{number}", address, f"--num-cpus={cpus}")
+
+    def kill(self, node: str) -> None:
+        """Kill a node with all that runs on it, as a loss of power does."""
+        for _ in range(100):
+            left = marked(f"{self.name}-{node}")
+            for pid in left:
+                try:
+                    os.kill(pid, signal.SIGKILL)
+                except ProcessLookupError:
+                    continue
+            if not left:
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"{node} cannot be killed")
+
+    def close(self) -> None:
+        for node in self.nodes:
+            self.kill(node)
+        shutil.rmtree(self.temp, ignore_errors=True)
+
+    def _start(self, node: str, *arguments: str) -> None:
+        environment = os.environ | {
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN": self.token,
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_worker_cap_enabled": "0",
+            "RAY_health_check_period_ms": "1000",
+            "RAY_health_check_failure_threshold": "3",
+            "RAY_health_check_timeout_ms": "1000",
+            "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "OMP_NUM_THREADS": "1",
+            MARK: f"{self.name}-{node}",
+        }
+        for name in ("RAY_AUTH_TOKEN_PATH", "RAY_ADDRESS", "PUP_SESSION"):
+            environment.pop(name, None)
+        command = [
+            *(sys.executable, "-m", "ray.scripts.scripts", "start", "--block"),
+            *("--node-ip-address=127.0.0.1", "--object-store-memory=80000000"),
+            *("--disable-usage-stats", f"--dashboard-agent-listen-port={free_port()}"),
+            *((f"--temp-dir={self.temp}",) if "--head" in arguments else ()),
+            *arguments,
+        ]
+        with open(self._log(node), "ab") as log:
+            subprocess.Popen(
+                command,
+                cwd=self.folder,
+                env=environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        if node not in self.nodes:
+            self.nodes.append(node)
+
+    def _log(self, node: str) -> Path:
+        return self.folder / f"{node}.log"
