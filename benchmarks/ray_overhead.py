@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from benchmarks.paired import ROBOT, Report, parser, ratio, shipped
 from pup.physics.parameters import robot_space
-from pup.recording import Recording
+from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription
 from pup.sysid.fit import CmaFit, FitSettings
 from pup.sysid.problem import Problem
@@ -59,12 +59,15 @@ PAPER_SIZE = 5  # times the shipped recordings are as many as the paper's 60
 
 def main() -> None:
     options = parser(__doc__, rounds=3)
+    options.add_argument("--recordings", type=Path, help="of darwin_op2; default: the shipped ones")
     given = options.parse_args()
     os.environ.setdefault("RAY_worker_niceness", "0")
     report = Report("ray_overhead", given.json)
     robot = RobotDescription.load(ROBOT)
-    suspended, ground = shipped(robot, "suspended"), shipped(robot, "ground")
-    recordings = suspended + ground
+    recordings = shipped(robot, "suspended") + shipped(robot, "ground")
+    if given.recordings:
+        recordings = tuple(load_recordings([given.recordings]))
+    suspended = tuple(r for r in recordings if r.support == "suspended")
     few = suspended[:FEW]
     report.add("against_local", _against_local(robot, few, given.rounds, report))
     report.add("machine", _two_processes(robot, few, given.rounds, report))

@@ -102,6 +102,19 @@ def test_falls_and_stands_are_weighed_as_the_paper_has_it() -> None:
     assert loss.total(loss.terms(seen), [2]) == pytest.approx([0.0])
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_what_stands_before_a_recording_does_not_matter(order: tuple[int, int]) -> None:
+    """Feet that a suspended recording does not have are no step of the next one's."""
+    still = np.zeros((2, 2))
+    air = recorded("air", still), np.full((2, 2, 3), NAN)
+    stood = recorded("stood", still, support="ground", motion="standup"), np.ones((2, 2, 3))
+    stood[1][1, 0] = [1.0, 1.0, 1.5]  # one foot, half a metre up
+    recordings, feet = zip(*((air, stood)[i] for i in order), strict=True)
+    loss = loss_of(*recordings)
+    seen = replayed(recordings, position=np.zeros((4, 2)), feet=np.concatenate(feet))
+    assert loss.terms(seen).feet.sum() == pytest.approx(0.5)
+
+
 def test_tilt_goes_the_short_way_round() -> None:
     lying = recorded("f", np.zeros((2, 2)), [[3.1, 0], [-3.1, 0]], motion="fall", support="ground")
     loss = loss_of(lying)

@@ -154,8 +154,9 @@ class ReplayLoss:
         Summed, that is the length of their path: it does not grow with the number of ticks, and a
         foot that settles by a millimetre at the start counts that millimetre once.
         """
-        flat = _flat(np.diff(trajectories.feet, axis=1, prepend=trajectories.feet[:, :1]))
-        flat[:, self.starts] *= 0.0  # no step from one recording to the next
+        feet = _flat(trajectories.feet)
+        flat = np.diff(feet, axis=1, prepend=feet[:, :1])
+        flat[:, self.starts] = 0.0 * feet[:, self.starts]  # no step from the recording before
         return _difference(flat, np.zeros(flat.shape[2]), LOST_FOOT)
 
     def _per_tick(self, values: NDArray[Any]) -> NDArray[Any]:
