@@ -32,8 +32,8 @@ from services.arguments import parser
 from services.cli import main
 from services.gateway.app import application
 from services.gateway.conductor import Conductor
-from services.gateway.dispatcher import Dispatcher
 from services.gateway.config import DATABASE_FILE, PREFIX, Config
+from services.gateway.dispatcher import Dispatcher
 from services.gateway.fits import Fits
 from services.gateway.keys import Tokens
 from services.gateway.metrics import Metrics
