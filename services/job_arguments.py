@@ -9,7 +9,7 @@ from pup.errors import InputError
 from pup.robot import built_in_robots
 from services.arguments import parser
 
-VERBS = ("import", "record", "presysid", "train", "replay", "diagnose", "run")
+VERBS = ("import", "export", "record", "presysid", "train", "replay", "diagnose", "run")
 """Verbs that can be jobs: those that read and write files and end by themselves."""
 RESUMABLE = ("presysid", "train", "diagnose", "run")
 """Those that go on from what they find in their folder; others begin anew."""

@@ -65,7 +65,7 @@ class Dispatcher:
         self.metrics, self.notify = metrics, notify
         self.jobs: dict[str, Job] = {}
         self.trouble = ""
-        """Why nothing is heard of the cluster or the shared storage, or empty."""
+        """What all jobs wait for, in words, or empty."""
         self._away = self._failed = ""
         self._stopped: ReplacedError | None = None
         self._locks: dict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
@@ -94,7 +94,7 @@ class Dispatcher:
         try:
             await self.ray.check()
         except RayAwayError as error:
-            self._away = f"the Ray cluster does not answer ({error})"
+            self._away = f"the Ray cluster, which {error}"
         self.metrics.ray.set(not self._away)
         room = asyncio.Semaphore(AT_ONCE)
 
@@ -208,9 +208,9 @@ class Dispatcher:
                 elif job.open:
                     await self._follow(job)
         except OSError as error:
-            self._failed = f"the shared storage takes no files ({error.strerror or error})"
+            self._failed = f"the shared storage, which takes no files ({error.strerror or error})"
         except RayAwayError as error:
-            self._failed = f"the Ray cluster does not answer ({error})"
+            self._failed = f"the Ray cluster, which {error}"
         except ReplacedError as error:
             self._stopped = error
         except Exception as error:
@@ -283,7 +283,7 @@ class Dispatcher:
 
     def _say(self, trouble: str) -> None:
         if trouble != self.trouble:
-            log.warning(trouble or "jobs go on")
+            log.warning(f"jobs wait for {trouble}" if trouble else "jobs go on")
             for name in [LIST, *(LIST + job.id for job in self.jobs.values() if job.open)]:
                 self.notify(name)
         self.trouble = trouble

@@ -181,7 +181,7 @@ async def cancel_job(
 ) -> Response:
     """Call a job off: its processes end, what they wrote stays. Operators do so with their own."""
     dispatcher = dispatcher_of(request)
-    _may(user, dispatcher.job(job))
+    _check(user, dispatcher.job(job))
     return as_json(await document(dispatcher, await dispatcher.cancel(job, user.name)))
 
 
@@ -194,7 +194,7 @@ async def retry_job(
     `attempt` is the number of the new attempt.
     """
     dispatcher = dispatcher_of(request)
-    _may(user, dispatcher.job(job))
+    _check(user, dispatcher.job(job))
     again = await dispatcher.retry(job, wanted.attempt, user.name)
     return as_json(await document(dispatcher, again))
 
@@ -271,8 +271,13 @@ async def stream_jobs(request: Request, _: Viewer) -> Response:
     return stream(request, LIST)
 
 
-def _may(user: User, job: Job) -> None:
-    if user.role < Role.ADMIN and user.name != job.who:
+def may(user: User, job: Job) -> bool:
+    """Whether a user may call a job off or try it again."""
+    return user.role is Role.ADMIN or (user.role is Role.OPERATOR and user.name == job.who)
+
+
+def _check(user: User, job: Job) -> None:
+    if not may(user, job):
         raise HTTPException(403, f"{job.id} is {job.who}'s; the role admin is needed")
 
 

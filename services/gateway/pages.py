@@ -1,5 +1,7 @@
-"""The pages: studies, one study as it goes on, agents. No script or style from elsewhere."""
+"""The pages: studies, jobs, one of them as it goes on, agents. Nothing comes from elsewhere."""
 
+import asyncio
+import time
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
@@ -9,7 +11,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment, PackageLoader, select_autoescape
 from markupsafe import Markup
 
-from services.gateway import drawing, names  # noqa: F401 - names makes {study:name} known
+from services.gateway import drawing, job_routes, names  # noqa: F401 - names makes {study:name} known
 from services.gateway.access import COOKIE, asking
 from services.gateway.conductor import Conductor
 from services.gateway.keys import Role, Tokens, User
@@ -21,6 +23,8 @@ FORM_LIMIT = 1024
 """Of a form, bytes."""
 SHOWN = 60
 """Numbers of an agent's health on its card."""
+JOBS, ARTIFACTS, LOG = 100, 100, 6000
+"""Jobs on their page; files and last bytes of the log on the page of one."""
 
 router = APIRouter(include_in_schema=False)
 _templates = Environment(
@@ -29,6 +33,7 @@ _templates = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+_templates.filters["when"] = lambda at: time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(at))
 
 
 def _page(
@@ -110,6 +115,43 @@ async def one(request: Request, study: str) -> Response:
         best=best,
         progress=Markup(drawing.progress(found)),
         slices=[Markup(s) for s in drawing.slices(posterior, found)] if best else [],
+    )
+
+
+@router.get("/jobs")
+@router.get("/jobs/live")
+async def jobs(request: Request) -> Response:
+    """Jobs, newest first; `live` is the part that changes."""
+    if (user := asking(request)) is None:
+        return _login(request)
+    dispatcher = job_routes.dispatcher_of(request)
+    found = dispatcher.newest()
+    told = [await job_routes.document(dispatcher, job) for job in found[:JOBS]]
+    more = len(found) - len(told)
+    name = "jobs_live.html" if request.url.path.endswith("/live") else "jobs.html"
+    return _page(name, request, user, jobs=told, more=more, trouble=dispatcher.trouble)
+
+
+@router.get("/jobs/{job:name}")
+@router.get("/jobs/{job:name}/live")
+async def one_job(request: Request, job: str) -> Response:
+    """A job; `live` is the part that changes."""
+    if (user := asking(request)) is None:
+        return _login(request)
+    dispatcher = job_routes.dispatcher_of(request)
+    found = dispatcher.job(job)
+    files = await job_routes.artifacts(dispatcher, found)
+    name = "job_live.html" if request.url.path.endswith("/live") else "job.html"
+    return _page(
+        name,
+        request,
+        user,
+        job=await job_routes.document(dispatcher, found),
+        open=found.open,
+        mine=job_routes.may(user, found),
+        artifacts=files[:ARTIFACTS],
+        more=len(files[ARTIFACTS:]),
+        log=await asyncio.to_thread(dispatcher.folder(job).tail, LOG),
     )
 
 

@@ -21,7 +21,7 @@ UNSTARTED = "JOB_SUPERVISOR_ACTOR_START_TIMEOUT"
 
 
 class RayAwayError(RuntimeError):
-    """The cluster does not answer, or not us."""
+    """The cluster does not answer, or not us: the end of a sentence on it."""
 
 
 class RayJobs:
@@ -64,7 +64,7 @@ class RayJobs:
             asked["entrypoint_num_gpus"] = gpus
         answer = await self._ask("POST", "/api/jobs/", json=asked)
         if answer.is_error and (await self.seen(submission)).status is Status.UNKNOWN:
-            raise RayAwayError(f"it takes no job: {answer.text.strip().splitlines()[-1][:200]}")
+            raise RayAwayError(f"takes no job ({answer.text.strip()[-200:]})")
 
     async def seen(self, submission: str) -> Seen:
         """How a job is there.
@@ -84,7 +84,7 @@ class RayJobs:
                 told.get("error_type") == UNSTARTED,
             )
         except (ValueError, KeyError, TypeError) as error:
-            raise RayAwayError(f"it answers {answer.status_code}") from error
+            raise RayAwayError(f"answers {answer.status_code}") from error
 
     async def stop(self, submission: str) -> None:
         """Ask a job's processes to end; those that do not are killed.
@@ -102,9 +102,9 @@ class RayJobs:
         try:
             answer = await self.http.request(method, path, **options)
         except httpx.HTTPError as error:
-            raise RayAwayError(str(error) or type(error).__name__) from error
+            raise RayAwayError(f"does not answer ({error or type(error).__name__})") from error
         if answer.status_code in (401, 403):
-            raise RayAwayError(f"it refuses the gateway's token ({answer.status_code})")
+            raise RayAwayError(f"refuses the gateway's token ({answer.status_code})")
         return answer
 
 

@@ -1,0 +1,129 @@
+"""The pages of jobs in a real headless Chromium: states, log, artefacts, buttons, on a phone."""
+
+import os
+import shutil
+from pathlib import Path
+
+import gateways
+import pytest
+import stored_jobs
+
+pytest.importorskip("fastapi")
+pytest.importorskip("botorch")
+playwright = pytest.importorskip("playwright.sync_api")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+AXE = os.environ.get("PUP_AXE")
+"""File axe.min.js of axe-core, where accessibility is to be checked by it."""
+SHOTS = os.environ.get("PUP_SHOTS")
+SIZES = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
+PATHS = ("/jobs", *(f"/jobs/{job.id}" for job in stored_jobs.ALL))
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pages")
+    shared = folder / "shared"
+    stored_jobs.keep(folder / "data", shared)
+    away = f"http://127.0.0.1:{gateways.free_port()}"
+    with gateways.running(folder / "data", RAY=away, SHARED=str(shared)) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def browser(service):  # whose store is written without a loop around it
+    with playwright.sync_playwright() as p:
+        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield made
+        made.close()
+
+
+@pytest.fixture
+def open_page(browser, service):
+    contexts, wrong = [], []
+
+    def opened(role="operator", size="wide"):
+        context = browser.new_context(base_url=service.url, viewport=SIZES[size])
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+        page.on(
+            "request",
+            lambda r: None if r.url.startswith(service.url) else wrong.append(r.url),
+        )
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.goto("/login")
+        page.get_by_label("Token").fill(service.tokens[role])
+        page.get_by_role("button", name="Enter").click()
+        page.wait_for_url("**/")
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+def shot(page, name):
+    if SHOTS:
+        Path(SHOTS).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=f"{SHOTS}/{name}.png", full_page=True)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_page_fits_and_is_accessible(open_page, size):
+    page = open_page(size=size)
+    for path in PATHS:
+        page.goto(path)
+        page.locator("h1").wait_for()
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= SIZES[size]["width"], f"{path} is wider than the screen"
+        shot(page, f"{size}{path.replace('/', '_')}")
+        if AXE:
+            page.evaluate(Path(AXE).read_text())
+            found = page.evaluate("axe.run()")["violations"]
+            told = [(v["id"], v["nodes"][0]["html"][:200]) for v in found]
+            assert told == [], path
+
+
+def test_a_job_is_told_with_its_log_and_files(open_page):
+    page = open_page()
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_text("Jobs wait for the Ray cluster, which does not answer").wait_for()
+    assert page.locator("tbody tr").count() == len(stored_jobs.ALL)
+    page.get_by_role("link", name="job-done").click()
+    page.get_by_text("generation 3 of 100").wait_for()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="checkpoints/fit 1%.npz").click()
+    assert Path(download.value.path()).read_bytes() == bytes(range(256)) * 1000
+    assert page.get_by_role("link", name="bounds.json").count() == 1
+    assert page.get_by_text("half").count() + page.get_by_text("link", exact=True).count() == 0
+
+
+def test_what_others_say_is_text(open_page):
+    page = open_page()
+    page.goto("/jobs/job-failed")
+    page.get_by_text("<script>alert(1)</script>").first.wait_for()
+
+
+def test_buttons_are_for_those_who_may(open_page):
+    page, viewer, admin = open_page(), open_page("viewer"), open_page("admin")
+    for one, path, count in (
+        (page, "/jobs/job-running", 1),
+        (page, "/jobs/job-other", 0),
+        (viewer, "/jobs/job-running", 0),
+        (admin, "/jobs/job-other", 1),
+        (page, "/jobs/job-done", 0),
+    ):
+        one.goto(path)
+        one.locator("h1").wait_for()
+        assert one.get_by_role("button", name="Cancel").count() == count, path
+    page.goto("/jobs/job-lost")
+    page.get_by_role("button", name="Try again").click()
+    page.get_by_text("queued", exact=True).wait_for()
+    page.goto("/jobs/job-running")
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_text("cancelling", exact=True).wait_for()
