@@ -14,9 +14,8 @@ FIT = ("recordings", "--robot", "darwin_leg")
 
 def of(name: str, state: JobState, reason: str = "", who: str = "operator", **more) -> Job:
     over = state in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED, JobState.LOST)
-    attempt = Attempt(
-        1, NOW - 90, True, NOW - 80, NOW - 5 if over else None, over * (reason or "done")
-    )
+    ended, outcome = (NOW - 5, reason or "done") if over else (None, "")
+    attempt = Attempt(1, NOW - 90, True, NOW - 80, ended, outcome)
     return Job(
         f"job-{name}",
         "presysid",
