@@ -229,6 +229,7 @@ def test_the_state_of_every_kind_of_effect_is_in_the_tasks_state() -> None:
         ("actuator_lag", ("actuator_lag/lagging",)),
         ("voltage_sag", ("voltage_sag/left",)),
         ("integral_action", ("integral_action/sum",)),
+        ("derivative_kick", ("derivative_kick/goal",)),
         ("target_rate_limit", ("target_rate_limit/goal",)),
         ("learned_law", ("learned_law/age",)),
         ("command_delay", ("held", "told")),

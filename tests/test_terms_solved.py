@@ -70,6 +70,12 @@ def integrating(t: float, x: Array, target: float) -> tuple[float, Sequence[floa
     return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if wound else target - q]
 
 
+def kicked(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, goal = x
+    rate = (target - goal) / 0.02
+    return np.clip(KP * (target - q) + 0.05 * rate - KD * v, -LIMIT, LIMIT) + weight(q), [rate]
+
+
 def dead(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     error = target - x[0]
     return servo(np.sign(error) * max(abs(error) - 0.01, 0), x[1]) + weight(x[0]), ()
@@ -177,6 +183,13 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "thermal_drift": ({"rate": 0.05}, drifting, (), INERTIA, 1e-4),
     "gain_asymmetry": ({"share": 0.2}, lopsided, (), INERTIA, 1e-4),
     "integral_action": ({"gain": 15.0}, integrating, (0.0,), INERTIA, 5e-4),
+    "derivative_kick": (
+        {"gain": 0.05, "time": 0.02},
+        kicked,
+        (float(RUN.target[0, 0]),),
+        INERTIA,
+        1e-3,
+    ),
     "dead_band": ({"width": 0.01}, dead, (), INERTIA, 1e-4),
     "cogging": ({"sine": 0.03, "cosine": 0.02, "teeth": 24.0}, rippling, (), INERTIA, 1e-4),
     "joint_spring": ({"stiffness": 0.4, "preload": 0.1}, sprung, (), INERTIA, 1e-4),

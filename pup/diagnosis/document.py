@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
+from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.verdict import Finding, HeldOut
 from pup.diagnosis.wording import SLIDING
-from pup.physics.terms import Place
+from pup.physics.terms import UNLISTED, Place
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits
 
@@ -50,7 +51,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
 
 def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]) -> dict[str, Any]:
     return {
-        "effect": finding.effect,
+        "effect": _named(finding.effect),
         "place": _place(finding.place, robot),
         "regime": finding.regime,
         "when": [{"recording": w.recording, "start": w.start, "end": w.end} for w in finding.when],
@@ -65,7 +66,7 @@ def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]
         "probability": round(finding.probability, 6),
         "equivalents": [
             {
-                "effect": a.effect,
+                "effect": _named(a.effect),
                 "place": _place(a.place, robot),
                 "probability": round(a.probability, 6),
             }
@@ -74,6 +75,11 @@ def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]
         "absorbed_by": dict(finding.absorbed_by),
         "law": finding.law,
     }
+
+
+def _named(effect: str) -> str:
+    """An effect by the contract's names."""
+    return NAMELESS if effect in UNLISTED else effect
 
 
 def _place(place: Place, robot: RobotDescription) -> dict[str, Any]:

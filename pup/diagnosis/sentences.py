@@ -328,6 +328,11 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     "joint_compliance": _compliance,
     "structural_flex": _flex,
     "integral_action": _integral,
+    "derivative_kick": lambda f: (
+        f"The derivative part of {f.at} acts on the error, not on the speed alone: a command that "
+        f"changes kicks the joint ahead with {f.speech.quantity(f.size['gain'], 'N m s/rad')}, "
+        f"over {f.speech.quantity(f.size['time'], 's')}."
+    ),
     "gain_asymmetry": _asymmetric_gain,
     "friction_asymmetry": _asymmetric_friction,
     "encoder_bias": lambda f: (

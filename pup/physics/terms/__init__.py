@@ -1,4 +1,4 @@
-"""The physics library: every effect of CONTRACTS.md, section 6, and how columns name it.
+"""The physics library: every effect of CONTRACTS.md, section 6, and more; how columns name them.
 
 A column `effect/quantity@place` of a parameter space puts a term into a simulation, with no other
 word anywhere: a space without such columns is the nominal model.
@@ -18,6 +18,7 @@ from pup.physics.terms.actuator import (
     ActuatorLag,
     Cogging,
     DeadBand,
+    DerivativeKick,
     GainAsymmetry,
     IntegralAction,
     QuadraticDamping,
@@ -74,6 +75,7 @@ TERMS: dict[str, type[Term]] = {
         DeadBand,
         GainAsymmetry,
         IntegralAction,
+        DerivativeKick,
         ThermalDrift,
         VoltageSag,
         TorqueSpeedLimit,
@@ -119,7 +121,7 @@ CLASSES: dict[str, tuple[str, ...]] = {
     "ripple": ("cogging",),
     "lost_motion": ("backlash", "dead_band"),
     "compliance": ("joint_compliance", "structural_flex"),
-    "hidden_control": ("integral_action",),
+    "hidden_control": ("integral_action", "derivative_kick"),
     "asymmetry": ("gain_asymmetry", "friction_asymmetry"),
     "bias": ("encoder_bias", "com_offset", "encoder_eccentricity"),
     "inertia": ("payload", "armature"),
@@ -133,6 +135,8 @@ CLASSES: dict[str, tuple[str, ...]] = {
     "imu": ("imu_misalignment", "imu_delay"),
     "external": ("external_force",),
 }
+UNLISTED = frozenset(("derivative_kick",))
+"""Effects that the contract has no name for; documents call them `unknown` and give their law."""
 CLASS_OF = {effect: name for name, effects in CLASSES.items() for effect in effects}
 
 
@@ -360,6 +364,7 @@ __all__ = [
     "CLASSES",
     "CLASS_OF",
     "TERMS",
+    "UNLISTED",
     "Drivetrain",
     "Kind",
     "Place",

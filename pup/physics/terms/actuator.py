@@ -162,6 +162,43 @@ class IntegralAction(Term):
         self._sum[:n] = np.clip(grown, -most, most)
 
 
+class DerivativeKick(Term):
+    """A derivative part that acts on the error: a command that changes drives the servo ahead.
+
+    The nominal law damps the velocity alone. A controller that differentiates its error adds the
+    rate of the command, filtered as it takes differences: each step of the command is a kick.
+    """
+
+    effect = "derivative_kick"
+    quantities = (
+        Quantity("gain", "N m s/rad", 0.2, 3.0),
+        Quantity("time", "s", 0.02, 0.1, grid=(0.007, 0.02)),
+    )
+    source = "MX-28 e-manual: D 16 of firmware 1.0 is 0.15 to 0.25 N m s/rad"
+    state = ("_goal",)
+
+    def prepare(self) -> None:
+        """See Term."""
+        self._goal = np.full_like(self.values["gain"], np.nan)
+        self._rate = np.zeros_like(self._goal)
+
+    def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
+        """See Term: commands stay as they are, their filtered rate is taken note of."""
+        n = len(now)
+        goal, lag = self._goal[:n], self.scene.timestep / np.maximum(self.values["time"][:n], 1e-9)
+        begin(goal, before)
+        at_change = before + np.exp(-lag * (1 - share)) * (goal - before)
+        later = now + np.exp(-lag * share) * (at_change - now)
+        self._rate[:n] = (later - goal) / self.scene.timestep
+        goal[:] = later
+        return now, before
+
+    def drive(self, drive: Drive) -> None:
+        """See Term."""
+        n = len(drive.torque)
+        drive.torque += self.values["gain"][:n] * self._rate[:n]
+
+
 class DeadBand(Term):
     """Errors below a width count as none, larger ones as less by it."""
 
