@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where a reader has saved the example's two files."""
     folder = tmp_path_factory.mktemp("reader")
     (folder / "two_link").mkdir()
-    (toml,), (xml,) = blocks("robots.md", "toml"), blocks("robots.md", "xml")
+    (toml, _), (xml,) = blocks("robots.md", "toml"), blocks("robots.md", "xml")
     (folder / "two_link" / "robot.toml").write_text(toml)
     (folder / "two_link" / "model.xml").write_text(xml)
     return folder
@@ -39,7 +39,7 @@ def test_the_example_is_a_robot(folder: Path) -> None:
 
 
 def test_the_commands_of_the_page_work(folder: Path) -> None:
-    (commands,) = blocks("robots.md", "sh")
+    commands, *_ = blocks("robots.md", "sh")
     for command in commands.splitlines():
         _, *arguments = shlex.split(command)
         done = pup_process(*arguments, folder=folder)

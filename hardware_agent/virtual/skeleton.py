@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from hardware_agent.virtual.character import Character
 from pup.errors import InputError
 from pup.robot import RobotDescription
+from pup.robot_stance import floor_normal
 
 Array = NDArray[np.float64]
 
@@ -105,8 +106,8 @@ def standing(robot: RobotDescription, model: mujoco.MjModel, pose: Array) -> Arr
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
     feet = [model.body(foot).id for foot in robot.feet]
-    up = np.mean([data.xmat[foot].reshape(3, 3)[:, 2] for foot in feet], axis=0)
-    data.qpos[3:7] = _upright(up)
+    axes = data.xmat[feet].reshape(-1, 3, 3)[:, :, 2]
+    data.qpos[3:7] = _upright(floor_normal(data.xpos[feet], axes))
     mujoco.mj_kinematics(model, data)
     data.qpos[2] = CLEAR - _lowest(model, data, feet)
     return np.array(data.qpos)
@@ -123,12 +124,12 @@ def _upright(up: Array) -> Array:
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, feet: list[int]) -> float:
-    """Height of the lowest point of the feet, which are boxes, above the mat at that place, m."""
+    """Height of the lowest corner of the feet above the mat at that place, m."""
     floor = model.geom(FLOOR).id
     normal = data.geom_xmat[floor].reshape(3, 3)[:, 2]
     heights = [
         normal @ (data.geom_xpos[g] - data.geom_xpos[floor])
-        - np.abs(normal @ data.geom_xmat[g].reshape(3, 3)) @ model.geom_size[g]
+        - np.abs(normal @ data.geom_xmat[g].reshape(3, 3)) @ model.geom_aabb[g, 3:]
         for g in range(model.ngeom)
         if model.geom_bodyid[g] in feet and model.geom_contype[g]
     ]

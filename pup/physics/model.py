@@ -12,6 +12,7 @@ from pup.errors import InputError
 from pup.physics.rotations import CONJUGATE, multiply
 from pup.recording import Recording
 from pup.robot import RobotDescription
+from pup.robot_stance import floor_normal
 
 Array = NDArray[np.float64]
 Selection = slice | NDArray[np.int64]
@@ -218,12 +219,11 @@ def _from_roll_pitch(roll: float, pitch: float) -> Array:
 
 
 def _feet_flat(robot: RobotDescription, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """The torso's tilt that brings the mean upward axis of the feet to the vertical."""
+    """The torso's tilt that lays the feet on a level floor."""
     if not robot.feet:
         return np.array([1.0, 0, 0, 0])
-    up = np.mean(
-        [data.xmat[model.body(foot).id].reshape(3, 3)[:, 2] for foot in robot.feet], axis=0
-    )
+    feet = [model.body(foot).id for foot in robot.feet]
+    up = floor_normal(data.xpos[feet], data.xmat[feet].reshape(-1, 3, 3)[:, :, 2])
     up /= np.linalg.norm(up)
     half = np.array([1 + up[2], up[1], -up[0], 0.0])  # shortest turn that takes `up` to z
     return np.asarray(half / np.linalg.norm(half))

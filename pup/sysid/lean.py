@@ -10,7 +10,13 @@ from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 
-DIRECTIONS = ("forward", "backward", "left", "right")
+TOWARDS = {
+    "forward": (1.0, 0.0, 0.0),
+    "backward": (-1.0, 0.0, 0.0),
+    "left": (0.0, 1.0, 0.0),
+    "right": (0.0, -1.0, 0.0),
+}
+DIRECTIONS = tuple(TOWARDS)
 LEAN = 0.5  # rad at the ankles; takes the centre of mass past the toes or the heels of a biped
 DRAWN_IN = 0.7  # share of the way to the squat of the leg on the side to fall to
 LATERAL = 0.9  # cosine of the angle to the y axis within which an axis counts as lateral
@@ -20,7 +26,8 @@ def falling_pose(robot: RobotDescription, direction: str) -> Array:
     """The pose to send to a robot that stands and shall fall, shape (n_joints,), rad.
 
     Forward and backward, the whole robot leans about the lateral joints next to its feet. To the
-    side, the leg there is drawn in, which also works where the ankles hardly roll.
+    side, the leg there is drawn in, which also works where the ankles hardly roll. On more than two
+    feet no ankle carries it over: the legs on the side to fall to are drawn in, whichever it is.
 
     Args:
       robot: with feet and the poses `stand` and `squat`.
@@ -32,13 +39,17 @@ def falling_pose(robot: RobotDescription, direction: str) -> Array:
     stand, squat = (np.array(robot.poses[name]) for name in ("stand", "squat"))
     model, data = _standing(robot, stand)
     legs = [_chain(robot, model, foot) for foot in robot.feet]
-    if direction in ("left", "right"):
-        side = np.array([data.xpos[model.body(foot).id][1] for foot in robot.feet])
-        leg = legs[int(np.argmax(side) if direction == "left" else np.argmin(side))]
-        if np.ptp(side) < 1e-3 or np.array_equal(stand[leg], squat[leg]):
-            raise InputError(f"robot {robot.name!r} has no leg to draw in; it cannot fall sideways")
+    if direction in ("left", "right") or len(legs) > 2:
+        feet = np.array([data.xpos[model.body(foot).id] for foot in robot.feet])
+        side = feet @ TOWARDS[direction]
+        there = [leg for leg, far in zip(legs, side > side.mean(), strict=True) if far]
+        drawn = [joint for leg in there for joint in leg]
+        if np.ptp(side) < 1e-3 or np.array_equal(stand[drawn], squat[drawn]):
+            raise InputError(
+                f"robot {robot.name!r} has no leg to draw in; it cannot fall {direction}"
+            )
         pose = stand.copy()
-        pose[leg] += DRAWN_IN * (squat - stand)[leg]
+        pose[drawn] += DRAWN_IN * (squat - stand)[drawn]
         return pose
     # With the foot on the floor, a joint's turn about its axis turns the torso the other way.
     way = -1.0 if direction == "forward" else 1.0
