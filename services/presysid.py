@@ -218,10 +218,8 @@ class _Job:
         at = space.normalise(space.nominal)
         known = confidence_at(bounded, at)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
-        # A subset's fit is pulled to the nominal point: where the data say nothing its range is
-        # narrow for that reason alone, and the interval takes its place.
-        lower = np.where(known.identified, lower, np.minimum(lower, known.lower))
-        upper = np.where(known.identified, upper, np.maximum(upper, known.upper))
+        # A few subsets, all pulled to the nominal point, may differ by less than the data allow.
+        lower, upper = np.minimum(lower, known.lower), np.maximum(upper, known.upper)
         actuator = self.options.actuator
         main, nominal = full[actuator], fitted["nominal", actuator]
         phi = [n for n in bounded.space.names if n in NETWORK_NAMES]

@@ -94,7 +94,7 @@ def test_intervals_are_those_of_the_normal_model() -> None:
     matrix, noise = rng.normal(size=(400, 3)), 0.05
     data = matrix @ np.array([0.4, 0.5, 0.6]) + noise * rng.normal(size=400)
     fit = least_squares(linear(matrix, data), np.full(3, 0.5))
-    told = confidence(unit_space(3), fit)
+    told = confidence(unit_space(3), fit.best, fit.covariance)
     covariance = noise**2 * np.linalg.inv(matrix.T @ matrix)
     reach = 1.645 * np.sqrt(np.diag(covariance))
     assert fit.noise == pytest.approx(noise, rel=0.15)
@@ -113,7 +113,7 @@ def test_what_the_data_do_not_see_is_said_so() -> None:
     data = matrix @ np.array([0.2, 0.6, 0.9, 0.4]) + 0.01 * rng.normal(size=100)
     start = np.full(4, 0.5)
     fit = least_squares(linear(matrix, data), start)
-    told = confidence(unit_space(4), fit)
+    told = confidence(unit_space(4), fit.best, fit.covariance)
     assert fit.converged
     assert told.identified.tolist() == [False, False, False, True]
     assert fit.best[2] == pytest.approx(start[2], abs=1e-3), "nothing moves it but rounding"
@@ -215,7 +215,7 @@ def test_servo_parameters_of_a_leg_come_back_from_a_replay() -> None:
     problem, truth = leg_problem(noise=0.002)
     space = problem.free_space
     fit = least_squares(position_errors(problem), space.normalise(space.nominal))
-    told = confidence(space, fit)
+    told = confidence(space, fit.best, fit.covariance)
     gains = np.array([n.startswith(("kp/", "kd/")) for n in space.names])
     assert fit.converged
     assert fit.replays < 400

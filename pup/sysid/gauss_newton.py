@@ -31,6 +31,8 @@ DAMPINGS = 10.0 ** np.arange(-3.0, 2.0)
 """Damping factors tried at once, relative to the current one."""
 HEAVIER = 1e5
 """Relative damping of a second try, where none of the first improves."""
+WEAKEST = 1e-6
+"""Of the stiffest direction: what is weaker is not followed as far as its slope says."""
 IDENTIFIED_SHARE = 0.5
 """A parameter is identified when its 90 % interval covers at most this share of its range."""
 
@@ -103,7 +105,7 @@ def least_squares(
     cost = prior.cost(value, at)
     replays, width, damping, converged = 1, 0, FIRST_DAMPING, False
     for _ in range(iterations):
-        jacobian = _jacobian(residuals, at, value, steps[width])
+        jacobian = differences(residuals, at, value, steps[width])
         replays += len(at)
         enough = cost - tolerance * cost
         for factors in (DAMPINGS, HEAVIER * DAMPINGS):
@@ -114,6 +116,11 @@ def least_squares(
             pick = int(np.argmin(costs))
             if costs[pick] < enough:
                 break
+        else:
+            parts = _component_steps(jacobian, value, at, prior)
+            trials, values, costs = _best_parts(residuals, parts, at, cost, prior)
+            replays += len(trials)
+            pick, factors = int(np.argmin(costs)), np.ones(len(trials))
         if costs[pick] < cost:
             at, value, cost = trials[pick], values[pick], costs[pick]
         if cost < enough:
@@ -123,21 +130,27 @@ def least_squares(
         else:
             converged = True
             break
-    jacobian = _jacobian(residuals, at, value, CURVATURE_STEP if step is None else step)
+    jacobian = differences(residuals, at, value, CURVATURE_STEP if step is None else step)
     freedom = max(1, len(value) - len(at))
     noise = float(np.sqrt(value @ value / freedom))
     covariance = _covariance(jacobian, noise, prior)
     return LeastSquares(at, cost, converged, replays + len(at), covariance, noise)
 
 
-def confidence(space: ParameterSpace, fit: LeastSquares) -> Confidence:
-    """90 % intervals and correlations of a fit, assuming the model right."""
-    sd = np.sqrt(np.diag(fit.covariance))
+def confidence(space: ParameterSpace, best: Array, covariance: Array) -> Confidence:
+    """90 % intervals and correlations of a fit, assuming the model right.
+
+    Args:
+      space: the parameters.
+      best: where the fit ended on the unit cube, shape (n_parameters,).
+      covariance: there, shape (n_parameters, n_parameters).
+    """
+    sd = np.sqrt(np.diag(covariance))
     reach = stats.norm.ppf(0.95) * sd
-    correlation = fit.covariance / np.maximum(np.outer(sd, sd), 1e-300)
+    correlation = covariance / np.maximum(np.outer(sd, sd), 1e-300)
     return Confidence(
-        space.denormalise(np.clip(fit.best - reach, 0, 1)),
-        space.denormalise(np.clip(fit.best + reach, 0, 1)),
+        space.denormalise(np.clip(best - reach, 0, 1)),
+        space.denormalise(np.clip(best + reach, 0, 1)),
         correlation,
         2 * reach <= IDENTIFIED_SHARE,
     )
@@ -155,8 +168,18 @@ class _Prior:
         return float(value @ value + pull @ pull) / 2
 
 
-def _jacobian(residuals: Residuals, at: Array, value: Array, width: float) -> Array:
-    """One-sided differences into the cube, one batch; shape (n_residuals, n_parameters)."""
+def differences(residuals: Residuals, at: Array, value: Array, width: float) -> Array:
+    """Jacobian by one-sided differences into the cube, one batch.
+
+    Args:
+      residuals: of a batch of candidates.
+      at: shape (n_parameters,), on the unit cube.
+      value: the residuals there, shape (n_residuals,).
+      width: of the differences.
+
+    Returns:
+      Shape (n_residuals, n_parameters).
+    """
     step = np.where(at + width <= 1.0, width, -width)
     moved = at + np.diag(step)
     return np.asarray(((residuals(moved) - value) / step[:, None]).T)
@@ -164,12 +187,55 @@ def _jacobian(residuals: Residuals, at: Array, value: Array, width: float) -> Ar
 
 def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, prior: _Prior) -> Array:
     """Points of damped Gauss-Newton steps within the cube, shape (n_dampings, n_parameters)."""
+    normal, gradient, scale = _normal_equations(jacobian, value, at, prior)
+    systems = normal + dampings[:, None, None] * np.diag(scale)
+    return np.array([_step_within(system, gradient, at) for system in systems])
+
+
+def _normal_equations(
+    jacobian: Array, value: Array, at: Array, prior: _Prior
+) -> tuple[Array, Array, Array]:
+    """Normal matrix, gradient, and the matrix's diagonal with a floor."""
     normal = jacobian.T @ jacobian + np.diag(prior.weight**2)
     gradient = jacobian.T @ value + prior.weight**2 * (at - prior.mean)
     scale = np.diag(normal)
-    scale = np.maximum(scale, 1e-6 * scale.max() or 1.0)
-    systems = normal + dampings[:, None, None] * np.diag(scale)
-    return np.array([_step_within(system, gradient, at) for system in systems])
+    return normal, gradient, np.maximum(scale, 1e-6 * scale.max() or 1.0)
+
+
+def _component_steps(jacobian: Array, value: Array, at: Array, prior: _Prior) -> Array:
+    """The components of a Gauss-Newton step by the normal matrix's eigenvectors, a row each."""
+    normal, gradient, scale = _normal_equations(jacobian, value, at, prior)
+    root = np.sqrt(scale)
+    stiffness, directions = np.linalg.eigh(normal / np.outer(root, root))
+    along = (
+        directions.T @ (gradient / root) / np.maximum(stiffness, WEAKEST * stiffness.max() or 1.0)
+    )
+    return np.asarray(-(directions * along).T / root)
+
+
+def _best_parts(
+    residuals: Residuals, parts: Array, at: Array, cost: float, prior: _Prior
+) -> tuple[Array, Array, list[float]]:
+    """Points, residuals and costs of each part of a step alone and of all that help together.
+
+    A kink that one parameter meets holds a whole step back; the others go on without it.
+    """
+
+    def tried(steps: Array) -> tuple[Array, Array, list[float]]:
+        points = np.clip(at + steps, 0.0, 1.0)
+        values = residuals(points)
+        return points, values, [prior.cost(v, t) for v, t in zip(values, points, strict=True)]
+
+    points, values, costs = tried(parts)
+    helping = np.array(costs) < cost
+    if helping.sum() < 2:
+        return points, values, costs
+    together = tried(parts[helping].sum(axis=0)[None])
+    return (
+        np.vstack([points, together[0]]),
+        np.vstack([values, together[1]]),
+        costs + together[2],
+    )
 
 
 def _step_within(system: Array, gradient: Array, at: Array) -> Array:

@@ -22,11 +22,11 @@ STEP = 0.002
 """Finite-difference step on the unit cube: a coarser one misses the turns of sharp valleys."""
 SQUARES = 10
 """Iterations of plain least squares: equal weights lead along a valley, unequal ones hold there."""
-ROUNDS = 3
+ROUNDS = 6
 """Times the weights are renewed, at most."""
 ITERATIONS = 3
 """Iterations under the same weights."""
-GAIN = 1e-3
+GAIN = 2e-4
 """A round that lowers the objective by less than this share is the last."""
 FLOOR = 1e-3
 """Norms below this share of their mean are not weighted any higher."""
