@@ -213,6 +213,13 @@ def test_the_gateway_is_told_what_it_reads(name: str) -> None:
     assert ports == {"http": config.port, "link": LINK}
     mounts = [Path(m["mountPath"]) for m in container["volumeMounts"]]
     places = [config.data, *map(Path, (config.tokens, config.curve, config.agents))]
+    places += [Path(config.ray_token), Path(config.shared)]
+    ray = one(overlay(name), "RayCluster")
+    assert config.ray == f"http://{ray['metadata']['name']}-head-svc:8265"
+    nodes = [ray["spec"]["headGroupSpec"], *ray["spec"]["workerGroupSpecs"]]
+    for node in nodes:
+        held = node["template"]["spec"]["containers"][0]["volumeMounts"]
+        assert {"name": "shared", "mountPath": config.shared} in held
     for place in [*places, *([Path(database)] if database else [])]:
         assert any(place.is_relative_to(mount) for mount in mounts), place
 

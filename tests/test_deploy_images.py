@@ -249,6 +249,12 @@ def test_services_are_told_what_they_read() -> None:
     assert parser().parse_args(["serve", *lab["gateway"]["command"]]).action == "run"
     data = Path(environment("gateway")["PUP_DATA"])
     assert f"gateway:{data}" in lab["gateway"]["volumes"]
+    config = Config.read(None, lab["gateway"]["environment"])
+    head = lab["ray-head"]
+    assert config.ray == f"http://{head['hostname']}:8265"
+    assert f"shared:{config.shared}" in lab["gateway"]["volumes"]
+    for name in ("ray-head", "ray-worker"):
+        assert f"shared:{config.shared}" in lab[name]["volumes"]
     assert set(more["gateway"]["environment"]) <= SETTINGS
     for name in ("ray-head", "ray-worker"):
         told = lab[name]

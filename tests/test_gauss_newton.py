@@ -144,6 +144,18 @@ def test_wide_differences_lead_on_where_narrow_ones_see_a_stair() -> None:
     assert fit.best == pytest.approx(truth, abs=0.02)
 
 
+def test_a_kink_in_one_parameter_does_not_hold_back_the_others() -> None:
+    """A ditch narrower than any step: its slope promises much, and every step meets a wall."""
+
+    def residuals(unit: Array) -> Array:
+        wall = 100 * np.abs(unit[:, 0] - 0.5) + 1.0
+        ditch = np.where(np.abs(unit[:, 0] - 0.501) < 1e-9, 0.2, wall)
+        return np.stack([ditch, unit[:, 1] - 0.7], axis=1)
+
+    fit = least_squares(residuals, np.array([0.5, 0.2]), step=0.001)
+    assert fit.best == pytest.approx([0.5, 0.7], abs=1e-3)
+
+
 def test_replays_are_counted_and_come_in_batches() -> None:
     rng = np.random.default_rng(6)
     matrix = rng.normal(size=(30, 5))

@@ -28,8 +28,8 @@ class Role(IntEnum):
 
     Attributes:
       VIEWER: read.
-      OPERATOR: make studies, release, retry and cancel trials, stop robots.
-      ADMIN: all of the service.
+      OPERATOR: make studies, release, retry and cancel trials, stop robots, submit jobs.
+      ADMIN: all of the service, others' jobs too.
     """
 
     VIEWER = 1

@@ -170,6 +170,7 @@ class DerivativeKick(Term):
     """
 
     effect = "derivative_kick"
+    kinds = ("joint", "group", "robot")
     quantities = (
         Quantity("gain", "N m s/rad", 0.2, 3.0),
         Quantity("time", "s", 0.02, 0.1, grid=(0.007, 0.02)),
