@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from pup.errors import InputError
 from pup.transfer.study import TrialError
 from services.gateway.conductor import UnknownError
 from services.gateway.jobs import Job, JobState, Seen, Status, reconciled
@@ -220,8 +221,13 @@ class Dispatcher:
         """Store a new attempt, then ask Ray for it."""
         if self._away or time.time() < job.due:
             return
-        job = job.attempted(time.time())
-        await asyncio.to_thread(self._order, job, job.last.number)
+        before, job = job, job.attempted(time.time())
+        try:
+            await asyncio.to_thread(self._order, job, job.last.number)
+        except InputError as error:  # a newer program may refuse what an older one took
+            failed = replace(before, state=JobState.FAILED, reason=str(error))
+            await self._write(failed, Event("failed"))
+            return
         await self._write(job, Event("attempted", detail={"attempt": job.last.number}))
         await self._submit(job)
 
@@ -243,6 +249,8 @@ class Dispatcher:
         if not self._away:
             seen = await self.ray.seen(_submission(job))
         now = reconciled(job, seen, outcome, claimed, time.time())
+        if now.last.ended is not None and now.state is not JobState.SUCCEEDED:
+            await asyncio.to_thread(folder.revoke)  # it may live on behind a cut
         if now != job:
             await self._write(now, None if now.state is job.state else Event(now.state.value))
         if now.open and now.state is not JobState.QUEUED:
