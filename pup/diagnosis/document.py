@@ -7,13 +7,17 @@ import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS
-from pup.diagnosis.verdict import Finding, HeldOut
+from pup.diagnosis.verdict import Alternative, Finding, HeldOut
 from pup.diagnosis.wording import SLIDING
-from pup.physics.terms import UNLISTED, Place
+from pup.physics.terms import TERMS, UNLISTED, Term
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits
 
 SCHEMA = 1
+ALL_SERVOS = frozenset(
+    name for name, term in TERMS.items() if term.kinds == Term.kinds and name != "thermal_drift"
+)
+"""Effects of which the contract knows joints and groups, not the robot."""
 
 
 def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
@@ -52,7 +56,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
 def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]) -> dict[str, Any]:
     return {
         "effect": _named(finding.effect),
-        "place": _place(finding.place, robot),
+        "place": _place(finding, robot),
         "regime": finding.regime,
         "when": [{"recording": w.recording, "start": w.start, "end": w.end} for w in finding.when],
         "parameters": {
@@ -67,7 +71,7 @@ def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]
         "equivalents": [
             {
                 "effect": _named(a.effect),
-                "place": _place(a.place, robot),
+                "place": _place(a, robot),
                 "probability": round(a.probability, 6),
             }
             for a in finding.equivalents
@@ -82,7 +86,11 @@ def _named(effect: str) -> str:
     return NAMELESS if effect in UNLISTED else effect
 
 
-def _place(place: Place, robot: RobotDescription) -> dict[str, Any]:
+def _place(claim: Finding | Alternative, robot: RobotDescription) -> dict[str, Any]:
+    """A place by the contract's kinds: what all servos do is told as of all groups."""
+    place = claim.place
+    if place.kind == "robot" and claim.effect in ALL_SERVOS:
+        return {"kind": "group", "names": list(robot.groups)}
     named = {"bus": "bus", "robot": robot.name, "ground": "floor", "sensor": "imu"}
     return {"kind": place.kind, "names": [place.name or named[place.kind]]}
 

@@ -38,6 +38,8 @@ EXCESS = 0.03
 ABSOLUTE = 5.0
 SPARE = 0.02
 """Share of the noise that may be left by a fit that has stopped short."""
+SHORT = 0.06
+"""The same where starts agree: it counts against every effect, and only large ones are told."""
 ROUGH = 2e-3
 """Relative gain of chi-squared at which the starts may end: all that follows is the noise floor."""
 WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
@@ -71,7 +73,7 @@ class Certificate:
     @property
     def holds(self) -> bool:
         """Whether a verdict may be given."""
-        found_again = self.recovered <= SELF or self.left < SPARE * self.samples
+        found_again = self.recovered <= SELF or self.left < SHORT * self.samples
         return self.agree and found_again
 
 

@@ -20,6 +20,7 @@ from pup.diagnosis.fitting import (
     start_best,
     term_coordinate,
 )
+from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
@@ -41,19 +42,19 @@ CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
 SWAPS, RIVALS = 2, 2
 """Effects that may be exchanged, and rivals that each may be exchanged for."""
-MOST = 8
-"""Effects that are looked for."""
-NOMINAL, TYPICAL = 0.2, 0.5
-"""How far a coordinate is believed to move when a fold is left out: a logarithm, a typical size."""
+MOST, PLACES = 8, 16
+"""Effects that are looked for, and places that all of them together may act at."""
 KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""
 FORM = 0.03
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
 is no evidence of another."""
 REST = 0.3
-"""Share of what is more than noise at its joints that an effect explains. Many small effects make
+"""Share of what is more than noise at a joint that an effect explains. Many small effects make
 up for what the library does not know, and for a wrong form of what was found; a true one explains
 more."""
+ALIKE = 0.03
+"""The same share where the effect is known from another place: like servos do alike."""
 MATERIAL = 0.3
 """An effect is material if it explains an error of this share of some joint's noise, ..."""
 SIZABLE = 0.25
@@ -68,7 +69,7 @@ class Model:
       hypotheses: the effects, in the order in which they were found.
       freedom: of their magnitudes and shapes, how many the data see.
       fit: of nominal parameters and effects together.
-      held_out: what each fold costs by a fit without it, shape (n_folds,); see `_left_out`.
+      held_out: what each fold costs by a fit without it, shape (n_folds,); see `folds.left_out`.
       predicted: what those fits predict, shape (n_samples,), rad; empty where nobody has asked.
     """
 
@@ -140,7 +141,7 @@ class Selector:
         self.noise = noise
         self.found = tuple(found)
         self.enough = enough
-        self.folds = _folds(replays)
+        self.folds = folds(replays)
         self.nominal = self.predicting(self.model((), nominal))
 
     def run(self, start: Model) -> tuple[Model, list[Round]]:
@@ -162,7 +163,7 @@ class Selector:
 
     def _added(self, model: Model, rounds: list[Round]) -> Model:
         """The model with effects added as long as one holds; notes the rounds."""
-        while len(model.hypotheses) < MOST:
+        while len(model.hypotheses) < PLACES and len(_effects(model.hypotheses)) < MOST:
             chosen = self._round(model)
             if chosen is None:
                 break
@@ -235,12 +236,18 @@ class Selector:
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
     def _explains(self, before: Model, after: Model) -> bool:
-        """Whether an effect explains much of what more than noise there is at its joints."""
-        own = _joints(after.hypotheses[-1].place, self.replays.measured.robot)
-        here = own[self.replays.measured.channel]
-        assert before.fit.residual is not None and after.fit.residual is not None
-        then, now = before.fit.residual[here] ** 2, after.fit.residual[here] ** 2
-        return float((then - now).sum()) > REST * float((then - 1).sum())
+        """Whether an effect explains much of what more than noise there is where it shows most.
+
+        That is at one joint: others of its group may have troubles of their own besides.
+        """
+        measured, newest = self.replays.measured, after.hypotheses[-1]
+        own = _joints(newest.place, measured.robot)
+        then, now = (
+            _excess(fit, measured.channel, len(own))[own] for fit in (before.fit, after.fit)
+        )
+        most = int(np.argmax(then - now))
+        share = ALIKE if newest.effect in _effects(before.hypotheses) else REST
+        return bool((then - now)[most] > share * then[most])
 
     def blur(self, model: Model, share: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
@@ -324,7 +331,7 @@ class Selector:
                 hypotheses,
                 self._freedom(hypotheses),
                 fit,
-                np.array([_left_out(fit, inside) for inside in insides]),
+                np.array([left_out(fit, inside) for inside in insides]),
             )
             for hypotheses, fit in fitted
         ]
@@ -345,6 +352,16 @@ class Selector:
         return replace(model, predicted=predicted)
 
 
+def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
+    return {hypothesis.effect for hypothesis in hypotheses}
+
+
+def _excess(fit: Fit, channel: NDArray[np.int64], channels: int) -> Array:
+    """What of each channel's chi-squared is more than noise."""
+    assert fit.residual is not None
+    return np.asarray(np.bincount(channel, fit.residual**2 - 1, minlength=channels), dtype=float)
+
+
 def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
     """The channels of the joints at a place; all channels where it is none of some joints."""
     chosen = np.zeros(len(robot.joints) + 2, dtype=bool)
@@ -363,32 +380,6 @@ def _material(
     assert before.fit.residual is not None and after.fit.residual is not None
     explained = np.bincount(channel, before.fit.residual**2 - after.fit.residual**2)
     return bool((explained > MATERIAL**2 * np.bincount(channel)).any())
-
-
-def _left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:
-    """What some samples cost by a fit to the others, in one Gauss-Newton step.
-
-    It is their share of minus twice the logarithm of the evidence: their squared errors, weighed by
-    how well the other samples tell where they should lie. What one type of motion alone can tell is
-    then not held against a model, but its freedom is.
-    """
-    assert fit.jacobian is not None and fit.residual is not None
-    jacobian, residual = fit.jacobian, fit.residual
-    # What a model leaves counts as noise, else a wrong form would be sure of its parameters.
-    noise = max(1.0, fit.chi2 / len(residual))
-    reach = np.array([NOMINAL if c.scale is None else TYPICAL for c in fit.coordinates])
-    prior, outside = np.diag(1 / reach**2), jacobian[~inside]
-    normal = outside.T @ outside / noise + prior
-    step = np.linalg.solve(normal, outside.T @ residual[~inside] / noise)
-    own, here = jacobian[inside], residual[inside]
-    spread = np.linalg.slogdet(np.linalg.solve(normal, own.T @ own / noise) + np.eye(len(reach)))[1]
-    return float(max(here @ (here - own @ step), here @ here) + spread)
-
-
-def _folds(replays: Replays) -> list[list[int]]:
-    """What is left out together: types of motion, or where there is one, recordings."""
-    types = list(replays.measured.motions().values())
-    return types if len(types) > 1 else [[i] for i in range(len(replays.measured.recordings))]
 
 
 def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:

@@ -99,7 +99,6 @@ class ThermalDrift(Term):
     """Gains and limits drift with the time since the recording's start; positive weakens."""
 
     effect = "thermal_drift"
-    kinds = ("joint", "group", "robot")
     quantities = (Quantity("rate", "1/s", 0.005, 0.05, signed=True),)
     source = "a 3S battery from 12.6 to 10.5 V loses 17 %, copper at +50 K 20 %"
 
@@ -170,7 +169,6 @@ class DerivativeKick(Term):
     """
 
     effect = "derivative_kick"
-    kinds = ("joint", "group", "robot")
     quantities = (
         Quantity("gain", "N m s/rad", 0.2, 3.0),
         Quantity("time", "s", 0.02, 0.1, grid=(0.007, 0.02)),

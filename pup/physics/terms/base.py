@@ -167,7 +167,7 @@ class Term:
     """
 
     effect: ClassVar[str]
-    kinds: ClassVar[tuple[Kind, ...]] = ("joint", "group")
+    kinds: ClassVar[tuple[Kind, ...]] = ("joint", "group", "robot")
     quantities: ClassVar[tuple[Quantity, ...]]
     source: ClassVar[str]
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"

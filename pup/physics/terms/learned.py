@@ -151,7 +151,6 @@ class LearnedLaw(Term):
     """A sum of features, each times a coefficient, added to what reaches the link."""
 
     effect = "learned_law"
-    kinds = ("joint", "group", "robot")
     quantities = tuple(
         Quantity(name, unit(name), typical(name), MOST * typical(name), signed=True)
         for name in FEATURES

@@ -1,0 +1,36 @@
+"""Leaving out: what is left out together, and what it costs by a fit to the rest."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.replays import Replays
+
+NOMINAL, TYPICAL = 0.2, 0.5
+"""How far a coordinate is believed to move when a fold is left out: a logarithm, a typical size."""
+
+
+def folds(replays: Replays) -> list[list[int]]:
+    """What is left out together: types of motion, or where there is one, recordings."""
+    types = list(replays.measured.motions().values())
+    return types if len(types) > 1 else [[i] for i in range(len(replays.measured.recordings))]
+
+
+def left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:
+    """What some samples cost by a fit to the others, in one Gauss-Newton step.
+
+    It is their share of minus twice the logarithm of the evidence: their squared errors, weighed by
+    how well the other samples tell where they should lie. What one type of motion alone can tell is
+    then not held against a model, but its freedom is.
+    """
+    assert fit.jacobian is not None and fit.residual is not None
+    jacobian, residual = fit.jacobian, fit.residual
+    # What a model leaves counts as noise, else a wrong form would be sure of its parameters.
+    noise = max(1.0, fit.chi2 / len(residual))
+    reach = np.array([NOMINAL if c.scale is None else TYPICAL for c in fit.coordinates])
+    prior, outside = np.diag(1 / reach**2), jacobian[~inside]
+    normal = outside.T @ outside / noise + prior
+    step = np.linalg.solve(normal, outside.T @ residual[~inside] / noise)
+    own, here = jacobian[inside], residual[inside]
+    spread = np.linalg.slogdet(np.linalg.solve(normal, own.T @ own / noise) + np.eye(len(reach)))[1]
+    return float(max(here @ (here - own @ step), here @ here) + spread)
