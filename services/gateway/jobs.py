@@ -205,9 +205,10 @@ def reconciled(job: Job, seen: Seen, outcome: Outcome | None, claimed: bool, now
     if seen.unstarted and not job.cancelled_by:
         why = "the Ray cluster found no room for it in time"
         return _end(job, JobState.QUEUED, f"{why}; it is asked again", now, why)
-    code = DONE if seen.status is Status.SUCCEEDED else seen.exit
-    if code is not None:
-        return _ended(job, code, seen.message, seen, now)
+    if seen.status is Status.SUCCEEDED:
+        return _ended(job, DONE, seen.message, seen, now)
+    if seen.status is Status.FAILED and seen.exit:
+        return _ended(job, seen.exit, seen.message, seen, now)
     if seen.status is Status.STOPPED:
         return _end(job, JobState.CANCELLED, job.reason if job.cancelled_by else ELSEWHERE, now)
     return _fallen(job, JobState.LOST, f"its process was lost ({_line(seen.message)})", now)
