@@ -133,12 +133,14 @@ def draw_gait(file: Path, robot: RobotDescription, footage: Footage) -> None:
     times = np.linspace(0.0, span, FIGURES) + max(0.0, last / 2 - span / 2)
     frames = np.clip(np.searchsorted(footage.time, times), 0, len(footage.time) - 1)
     height = float(scene.show(0).xpos[:, 2].max())
+    places = [end[0] for a, b, _ in scene.sticks(0) for end in (a, b)]
+    apart = max(0.7 * height, 1.3 * float(np.ptp(places)))
     with drawing_style():
         figure = new_figure(11.0, 3.2)
         axes = figure.subplots()
         for i, frame in enumerate(frames):
-            _draw_sticks(axes, scene.sticks(int(frame)), shift=0.7 * height * i)
-            axes.text(0.7 * height * i, 1.25 * height, f"{footage.time[frame]:.2f} s", ha="center")
+            _draw_sticks(axes, scene.sticks(int(frame)), shift=apart * i)
+            axes.text(apart * i, 1.25 * height, f"{footage.time[frame]:.2f} s", ha="center")
         axes.axhline(0.0, color=SOFT, linewidth=0.8)
         axes.set_aspect("equal")
         axes.set_axis_off()
