@@ -63,24 +63,25 @@ class RayCluster:
 
     def start_head(self) -> None:
         more = (f"--port={self.gcs}", f"--dashboard-port={self.dashboard}", "--num-cpus=0")
-        self._start("head", "--head", "--include-dashboard=true", *more)
-        for _ in range(600):
-            try:
-                headers = {"Authorization": f"Bearer {self.token}"}
-                if httpx.get(f"{self.url}/api/jobs/", headers=headers).status_code == 200:
-                    return
-            except httpx.HTTPError:
-                pass
-            time.sleep(0.2)
-        raise AssertionError(f"Ray does not start: {self._log('head').read_text()}")
+        self._start("head", 1, "--head", "--include-dashboard=true", *more)
 
     def start_worker(self, number: int, cpus: int = 1) -> None:
-        address = f"--address=127.0.0.1:{self.gcs}"
-        self._start(f"worker{number}", address, f"--num-cpus={cpus}")
+        there, address = self._alive(), f"--address=127.0.0.1:{self.gcs}"
+        self._start(f"worker{number}", there + 1, address, f"--num-cpus={cpus}")
+
+    def _alive(self) -> int:
+        """Nodes that the cluster believes in."""
+        headers = {"Authorization": f"Bearer {self.token}"}
+        try:
+            answer = httpx.get(f"{self.url}/nodes?view=summary", headers=headers, timeout=20)
+            nodes = answer.json()["data"]["summary"]
+        except (httpx.HTTPError, ValueError, KeyError):
+            return 0
+        return sum(node["raylet"].get("state") == "ALIVE" for node in nodes)
 
     def kill(self, node: str) -> None:
         """Kill a node with all that runs on it, as a loss of power does."""
-        for _ in range(100):
+        for _ in range(600):
             left = marked(f"{self.name}-{node}")
             for pid in left:
                 try:
@@ -97,15 +98,28 @@ class RayCluster:
             self.kill(node)
         shutil.rmtree(self.temp, ignore_errors=True)
 
-    def _start(self, node: str, *arguments: str) -> None:
+    def _start(self, node: str, alive: int, *arguments: str) -> None:
+        """Start a node; on a busy machine Ray gives up after a minute, so more than once."""
+        for _ in range(4):
+            process = self._process(node, arguments)
+            while process.poll() is None:
+                if self._alive() >= alive:
+                    return
+                time.sleep(0.3)
+            self.kill(node)
+        raise AssertionError(f"{node} does not start: {self._log(node).read_text()}")
+
+    def _process(self, node: str, arguments: tuple[str, ...]) -> "subprocess.Popen[bytes]":
         environment = os.environ | {
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": self.token,
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_worker_cap_enabled": "0",
             "RAY_health_check_period_ms": "1000",
-            "RAY_health_check_failure_threshold": "3",
-            "RAY_health_check_timeout_ms": "1000",
+            "RAY_health_check_failure_threshold": "6",
+            "RAY_health_check_timeout_ms": "3000",
+            "RAY_raylet_start_wait_time_s": "120",
+            "RAY_DASHBOARD_STARTUP_TIMEOUT_S": "240",
             "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
             "OMP_NUM_THREADS": "1",
@@ -120,8 +134,10 @@ class RayCluster:
             *((f"--temp-dir={self.temp}",) if "--head" in arguments else ()),
             *arguments,
         ]
+        if node not in self.nodes:
+            self.nodes.append(node)
         with open(self._log(node), "ab") as log:
-            subprocess.Popen(
+            return subprocess.Popen(
                 command,
                 cwd=self.folder,
                 env=environment,
@@ -129,8 +145,6 @@ class RayCluster:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-        if node not in self.nodes:
-            self.nodes.append(node)
 
     def _log(self, node: str) -> Path:
         return self.folder / f"{node}.log"

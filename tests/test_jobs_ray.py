@@ -1,5 +1,6 @@
 """Jobs on a real Ray of three nodes with token authentication, through a real gateway."""
 
+import functools
 import json
 import os
 import shutil
@@ -14,10 +15,10 @@ import gateways
 import ray_clusters
 from commandline import files, pup_process
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.timeout(2400)]
 FIT = ("--robot", "servo_bench", "--actuator", "pd", "--no-comparison", "--population", "4")
 FIT += ("--subsets", "2", "--subset-generations", "1", "--seed", "5")
-SHORT, LONG = (*FIT, "--generations", "3"), (*FIT, "--generations", "5000")
+SHORT, LONG, ENDLESS = ((*FIT, "--generations", n) for n in ("3", "60", "100000"))
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +65,10 @@ def told(service, job):
         return http.get(f"/v1/jobs/{job}").json()
 
 
-def wait_for(service, job, *states, seconds=120):
+def wait_for(service, job, *states, seconds=600):
     end = time.monotonic() + seconds
     while (now := told(service, job))["state"] not in states:
-        assert time.monotonic() < end, now
+        assert time.monotonic() < end, f"{now}\n{log_of(service, job)}"
         time.sleep(0.2)
     return now
 
@@ -77,23 +78,31 @@ def log_of(service, job):
         return http.get(f"/v1/jobs/{job}/logs").text
 
 
-def wait_for_checkpoint(service, shared, job, seconds=120):
+def wait_for_checkpoint(service, shared, job, seconds=600):
     """Until the job's verb has written down how far it is."""
     end = time.monotonic() + seconds
-    while not list((shared / "jobs" / job / "out").glob("checkpoints/*")):
+    while not list((shared / "jobs" / job / "out").glob("checkpoints/**/*.npz")):
         assert time.monotonic() < end, (told(service, job), log_of(service, job))
         time.sleep(0.2)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory, shared):
-    """What the short fit gives in one process without Ray."""
-    out = tmp_path_factory.mktemp("alone")
-    done = pup_process(
-        "presysid", shared / "recordings", *SHORT, "--local", "--cores", 1, "--out", out
-    )
-    assert done.code == 0, done.err
-    return json.loads((out / "bounds.json").read_text())
+    """Gives what a fit finds in one process without Ray."""
+
+    @functools.cache
+    def alone(fit):
+        out = tmp_path_factory.mktemp("alone")
+        where = ("--local", "--cores", 1, "--out", out)
+        done = pup_process("presysid", shared / "recordings", *fit, *where)
+        assert done.code == 0, done.err
+        return parameters(out)
+
+    return alone
+
+
+def parameters(out):
+    return json.loads((out / "bounds.json").read_text())["parameters"]
 
 
 def test_submit_watch_and_fetch_by_command(service, shared, undisturbed, tmp_path):
@@ -115,8 +124,7 @@ def test_submit_watch_and_fetch_by_command(service, shared, undisturbed, tmp_pat
     assert files(out) == {
         k: v for k, v in files(shared / "jobs" / job["id"] / "out").items() if "/." not in f"/{k}"
     }
-    bounds = json.loads((out / "bounds.json").read_text())
-    assert bounds["parameters"] == undisturbed["parameters"]
+    assert parameters(out) == undisturbed(SHORT)
     with service.client() as http:
         metrics = http.get("/metrics").text
     assert 'pup_jobs{state="succeeded"}' in metrics and "pup_ray_up 1.0" in metrics
@@ -131,7 +139,7 @@ def test_bad_input_is_told_and_not_tried_again(service, shared):
 
 
 def test_cancel_leaves_nothing_behind(service, shared):
-    job = submitted(service, "presysid", "recordings", *LONG)
+    job = submitted(service, "presysid", "recordings", *ENDLESS)
     wait_for_checkpoint(service, shared, job)
     assert ray_clusters.commands(f"jobs/{job}")
     done = pup_process("jobs", "cancel", job, "--url", service.url, "--json")
@@ -152,3 +160,49 @@ def test_a_job_goes_on_while_the_gateway_is_away(service, shared):
     service.start()
     now = wait_for(service, job, "succeeded", "failed", "lost")
     assert now["state"] == "succeeded" and len(now["attempts"]) == 1, now
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_with_the_job_costs_one_attempt(service, cluster, shared, undisturbed):
+    job = submitted(service, "presysid", "recordings", *LONG)
+    wait_for_checkpoint(service, shared, job)
+    (pid, *_) = ray_clusters.commands(f"services.job_runner {shared}/jobs/{job}")
+    number = next(n for n in (1, 2) if pid in ray_clusters.marked(f"{cluster.name}-worker{n}"))
+    cluster.kill(f"worker{number}")
+    try:
+        now = wait_for(service, job, "succeeded", "failed", "lost", seconds=900)
+        assert now["state"] == "succeeded" and len(now["attempts"]) == 2, now
+        assert "lost" in now["attempts"][0]["outcome"]
+        assert parameters(shared / "jobs" / job / "out") == undisturbed(LONG)
+    finally:
+        cluster.start_worker(number, cpus=2)
+
+
+@pytest.mark.slow
+def test_a_restarted_head_loses_no_job(service, cluster, shared, undisturbed):
+    """Jobs that ended are told as they ended, one that ran resumes, one that waited is run."""
+    done = submitted(service, "presysid", "recordings", *SHORT)
+    wait_for(service, done, "succeeded")
+    runs = submitted(service, "presysid", "recordings", *LONG)
+    wait_for_checkpoint(service, shared, runs)
+    waits = submitted(service, "presysid", "recordings", *SHORT, cpus=4)
+    wait_for(service, waits, "waiting")
+    cluster.kill("head")
+    time.sleep(3)
+    assert told(service, done)["state"] == "succeeded"
+    assert "does not answer" in told(service, waits)["waits_for"]
+    queued = submitted(service, "presysid", "recordings", *SHORT)
+    assert told(service, queued)["state"] == "queued"
+    for node in ("worker1", "worker2"):
+        cluster.kill(node)
+    cluster.start_head()
+    cluster.start_worker(1, cpus=4)
+    cluster.start_worker(2, cpus=2)
+    for job in (runs, waits, queued):
+        now = wait_for(service, job, "succeeded", "failed", "lost", seconds=900)
+        assert now["state"] == "succeeded", now
+    attempts = told(service, runs)["attempts"]
+    assert len(attempts) == 2 and "does not know it any more" in attempts[0]["outcome"]
+    for job, fit in ((runs, LONG), (done, SHORT), (waits, SHORT), (queued, SHORT)):
+        assert parameters(shared / "jobs" / job / "out") == undisturbed(fit)
+    assert told(service, done)["attempts"][0]["outcome"] == "done"

@@ -1,0 +1,287 @@
+"""The REST interface of jobs, on a real gateway whose Ray cluster is away."""
+
+import json
+import socket
+
+import gateways
+import httpx
+import pytest
+import stored_jobs
+from commandline import files, pup
+from test_gateway import is_problem
+
+pytest.importorskip("fastapi")
+pytest.importorskip("botorch")
+
+FIT = {"verb": "presysid", "arguments": ["recordings", "--robot", "servo_bench"]}
+READS = ("/v1/jobs", "/v1/jobs/x", "/v1/jobs/x/logs", "/v1/jobs/x/artifacts", "/v1/jobs/-/events")
+READS += ("/v1/jobs/x/artifacts/a", "/v1/jobs/x/events")
+WRITES = ("/v1/jobs", "/v1/jobs/x:cancel", "/v1/jobs/x:retry")
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("jobs")
+    stored_jobs.keep(folder / "data", folder / "shared")
+    (folder / "shared" / "recordings").mkdir()
+    away = f"http://127.0.0.1:{gateways.free_port()}"
+    with gateways.running(folder / "data", RAY=away, SHARED=str(folder / "shared")) as made:
+        yield made
+
+
+def shared(service):
+    return service.data.parent / "shared"
+
+
+def test_without_a_token_nothing_is_read_or_done(service):
+    for path in READS:
+        for headers in ({}, {"Authorization": "Bearer wrong"}):
+            is_problem(httpx.get(service.url + path, headers=headers), 401)
+    for path in WRITES:
+        is_problem(httpx.post(service.url + path, json=FIT), 401)
+
+
+def test_who_may_do_what(service):
+    with service.client("viewer") as viewer, service.client("operator") as operator:
+        assert viewer.get("/v1/jobs/job-done").status_code == 200
+        for path in WRITES:
+            is_problem(viewer.post(path, json=FIT | {"attempt": 2}), 403)
+        told = is_problem(operator.post("/v1/jobs/job-other:cancel"), 403)
+        assert "somebody-else's" in told
+        is_problem(operator.post("/v1/jobs/absent:cancel"), 404)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"verb": "serve"},
+        {"verb": "presysid; true"},
+        {"arguments": ["recordings"]},
+        {"arguments": ["../recordings", "--robot", "servo_bench"]},
+        {"arguments": ["recordings", "--robot", "servo_bench", "--address", "x:1"]},
+        {"arguments": "recordings"},
+        {"arguments": ["x" * 2000]},
+        {"arguments": ["x"] * 300},
+        {"cpus": 0},
+        {"cpus": "many"},
+        {"gpus": -1},
+        {"retries": 1000},
+        {"entrypoint": "rm -rf /"},
+    ],
+)
+def test_what_cannot_run_is_refused_at_once(service, change):
+    with service.client() as http:
+        before = len(http.get("/v1/jobs").json()["jobs"])
+        is_problem(http.post("/v1/jobs", json=FIT | change), 422)
+        assert len(http.get("/v1/jobs").json()["jobs"]) == before
+
+
+def test_bodies_are_limited(service):
+    with service.client() as http:
+        big = b'{"verb": "' + b"x" * (5 * 2**20)
+        headers = {"Content-Type": "application/json"}
+        is_problem(http.post("/v1/jobs", content=big, headers=headers), 413)
+        is_problem(http.post("/v1/jobs", content=b"not json", headers=headers), 422)
+
+
+def test_a_job_waits_for_the_cluster_and_survives_a_restart(service):
+    with service.client() as http:
+        answer = http.post("/v1/jobs", json=FIT | {"cpus": 2, "retries": 1})
+        assert answer.status_code == 201
+        job = answer.json()
+        assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
+        assert (job["state"], job["who"], job["cpus"]) == ("queued", "operator", 2.0)
+        order = json.loads((shared(service) / "jobs" / job["id"] / "order.json").read_text())
+        assert order["command"][:2] == ["presysid", "recordings"] and order["attempt"] == 0
+    service.kill()
+    service.start()
+    with service.client() as http:
+        again = http.get(f"/v1/jobs/{job['id']}").json()
+        assert {k: again[k] for k in job if k != "waits_for"} == {
+            k: v for k, v in job.items() if k != "waits_for"
+        }
+        cancelled = http.post(f"/v1/jobs/{job['id']}:cancel").json()
+        assert cancelled["state"] == "cancelled" and "by operator" in cancelled["reason"]
+        is_problem(http.post(f"/v1/jobs/{job['id']}:cancel"), 409)
+
+
+def test_a_key_is_one_job(service):
+    headers = {"Idempotency-Key": "fit-of-today"}
+    with service.client() as http:
+        first = http.post("/v1/jobs", json=FIT, headers=headers)
+        second = http.post("/v1/jobs", json=FIT, headers=headers)
+        assert first.json()["id"] == second.json()["id"]
+        other = FIT | {"arguments": [*FIT["arguments"], "--seed", "2"]}
+        is_problem(http.post("/v1/jobs", json=other, headers=headers), 409)
+    service.kill()
+    service.start()
+    with service.client() as http, service.client("admin") as admin:
+        assert http.post("/v1/jobs", json=FIT, headers=headers).json()["id"] == first.json()["id"]
+        assert admin.post("/v1/jobs", json=FIT, headers=headers).json()["id"] != first.json()["id"]
+
+
+def test_a_job_that_runs_is_cancelled_without_the_cluster(service):
+    """Its process reads the order; what it leaves in shared storage tells that it ended."""
+    with service.client() as http:
+        assert http.post("/v1/jobs/job-running:cancel").json()["state"] == "cancelling"
+        order = shared(service) / "jobs" / "job-running" / "order.json"
+        assert json.loads(order.read_text())["stop"]
+        outcome = order.with_name("outcome-1.json")
+        outcome.write_text('{"schema": 1, "attempt": 1, "exit": 130}')
+        for _ in range(100):
+            if (job := http.get("/v1/jobs/job-running").json())["state"] != "cancelling":
+                break
+            httpx.get(f"{service.url}/healthz")
+        assert job["state"] == "cancelled"
+
+
+def test_what_ended_without_a_result_can_be_tried_again_once(service):
+    with service.client() as http:
+        is_problem(http.post("/v1/jobs/job-done:retry", json={"attempt": 2}), 409)
+        is_problem(http.post("/v1/jobs/job-lost:retry", json={"attempt": 3}), 409)
+        job = http.post("/v1/jobs/job-lost:retry", json={"attempt": 2}).json()
+        assert job["state"] == "queued" and "operator" in job["reason"]
+        is_problem(http.post("/v1/jobs/job-lost:retry", json={"attempt": 2}), 409)
+
+
+def test_logs_from_a_byte_on(service):
+    with service.client("viewer") as http:
+        whole = http.get("/v1/jobs/job-done/logs")
+        assert whole.text.startswith("attempt 1 on node\n")
+        assert whole.headers["content-type"].startswith("text/plain")
+        assert http.get("/v1/jobs/job-done/logs", params={"offset": 8}).text == whole.text[8:]
+        assert http.get("/v1/jobs/job-done/logs", params={"offset": 10**9}).text == ""
+        followed = http.get("/v1/jobs/job-done/logs", params={"follow": "true"})
+        assert followed.text == whole.text
+        is_problem(http.get("/v1/jobs/job-done/logs", params={"offset": -1}), 422)
+
+
+def test_a_log_is_followed_while_it_grows(service):
+    log = shared(service) / "jobs" / "job-other" / "log.txt"
+    path = "/v1/jobs/job-other/logs?follow=true"
+    with service.client() as http, http.stream("GET", path) as answer:
+        lines = answer.iter_lines()
+        assert next(lines) == "attempt 1 on node"
+        next(lines)
+        with log.open("a") as file:
+            file.write("generation 4\n")
+        assert next(lines) == "generation 4"
+
+
+def test_artefacts_by_name(service):
+    with service.client("viewer") as http:
+        listed = http.get("/v1/jobs/job-done/artifacts").json()["artifacts"]
+        assert [a["name"] for a in listed] == ["bounds.json", "checkpoints/fit 1%.npz"]
+        assert all(len(a["sha256"]) == 64 for a in listed)
+        answer = http.get("/v1/jobs/job-done/artifacts/bounds.json")
+        assert answer.json() == {"schema": 1}
+        assert answer.headers["content-disposition"].startswith("attachment")
+        part = http.get(
+            "/v1/jobs/job-done/artifacts/checkpoints/fit 1%25.npz", headers={"Range": "bytes=1-3"}
+        )
+        assert (part.status_code, part.content) == (206, b"\x01\x02\x03")
+        assert http.get("/v1/jobs/job-running/artifacts").json() == {"artifacts": []}
+
+
+ELSEWHERE = ("../order.json", "..%2forder.json", "%2e%2e/order.json", "/etc/hostname", "absent")
+ELSEWHERE += ("%2fetc%2fhostname", "link", "checkpoints", "checkpoints/../bounds.json", "%00")
+
+
+@pytest.mark.parametrize("name", (*ELSEWHERE, ".bounds.json.tmp"))
+def test_names_lead_nowhere_else(service, name):
+    """Sent as they are: clients would tidy them up."""
+    request = f"GET /v1/jobs/job-done/artifacts/{name} HTTP/1.1\r\nHost: x\r\n"
+    request += f"Authorization: Bearer {service.tokens['viewer']}\r\nConnection: close\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", service.port)) as made:
+        made.sendall(request.encode())
+        answer = b"".join(iter(lambda: made.recv(65536), b""))
+    assert b" 404 " in answer.splitlines()[0], answer
+
+
+def test_jobs_are_listed_in_pages_newest_first(service):
+    with service.client() as http:
+        whole = [j["id"] for j in http.get("/v1/jobs").json()["jobs"]]
+        paged, after = [], ""
+        while after is not None:
+            page = http.get("/v1/jobs", params={"limit": 2, "after": after}).json()
+            paged += [j["id"] for j in page["jobs"]]
+            after = page["next"]
+        assert paged == whole and len(whole) >= len(stored_jobs.ALL)
+        done = http.get("/v1/jobs", params={"state": "succeeded"}).json()["jobs"]
+        assert [j["id"] for j in done] == ["job-done"]
+        is_problem(http.get("/v1/jobs", params={"state": "odd"}), 422)
+        is_problem(http.get("/v1/jobs", params={"after": "absent"}), 404)
+
+
+def test_metrics_tell_jobs_by_state(service):
+    with service.client("viewer") as http:
+        text = http.get("/metrics").text
+    assert 'pup_jobs{state="succeeded"} 1.0' in text and "pup_ray_up 0.0" in text
+    assert 'pup_job_attempts_total{state="cancelled"}' in text
+
+
+def test_a_gateway_without_a_cluster_says_so(tmp_path):
+    with gateways.running(tmp_path / "data") as made, made.client() as http:
+        assert http.get("/v1/jobs").json() == {"jobs": [], "next": None}
+        assert "no Ray cluster" in is_problem(http.post("/v1/jobs", json=FIT), 503)
+
+
+@pytest.fixture
+def where(service, monkeypatch):
+    monkeypatch.setenv("PUP_TOKEN", service.tokens["operator"])
+    return ("--url", service.url)
+
+
+def test_the_command_line_submits_and_asks(service, where, tmp_path):
+    given = ("--key", "of-mine", "--retries", 0, "presysid", "recordings", "--robot", "servo_bench")
+    done = pup("submit", *where, "--json", *given)
+    assert done.code == 0, done.err
+    job = done.json()["job"]["id"]
+    assert pup("submit", *where, "--json", *given).json()["job"]["id"] == job
+    assert f"{service.url}/jobs/{job}" in pup("submit", *where, *given).out
+    assert job in pup("jobs", "list", *where).out
+    assert "queued" in pup("jobs", "status", job, *where).out
+    assert pup("jobs", "cancel", job, *where, "--json").json()["job"]["state"] == "cancelled"
+    assert pup("jobs", "retry", job, *where, "--json").json()["job"]["state"] == "queued"
+    assert "generation 3" in pup("jobs", "logs", "job-done", *where).out
+    out = tmp_path / "out"
+    fetched = pup("jobs", "fetch", "job-done", "--out", out, *where)
+    assert fetched.code == 0 and len(fetched.out.splitlines()) == 2
+    assert set(files(out)) == {"bounds.json", "checkpoints/fit 1%.npz"}
+    one = pup("jobs", "fetch", "job-done", "bounds.json", "--out", tmp_path / "one", *where)
+    assert one.code == 0 and set(files(tmp_path / "one")) == {"bounds.json"}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("submit", "serve"), "cannot be a job"),
+        (("submit", "presysid", "recordings"), "--robot"),
+        (("submit", "presysid", "absent", "--robot", "servo_bench"), "not in the shared storage"),
+        (("submit", "presysid", "x", "--robot", "servo_bench", "--out", "y"), "folder of its own"),
+        (("submit", "--cpus", "0", "presysid"), "--cpus"),
+        (("jobs", "status", "absent"), "there is no job absent"),
+        (("jobs", "status", "../x"), "is no name"),
+        (("jobs", "cancel", "job-done"), "succeeded"),
+        (("jobs", "fetch", "job-done", "absent", "--out", "x"), "no artefact absent"),
+        (("jobs", "odd"), "odd"),
+    ],
+)
+def test_an_error_is_one_line(service, where, tmp_path, monkeypatch, given, words):
+    monkeypatch.chdir(tmp_path)
+    at = () if given[-1] == "odd" else where
+    put = 2 if given[0] == "jobs" else 1
+    done = pup(*given[:put], *at, *given[put:])
+    last = done.err.strip().splitlines()[-1]
+    assert done.code == 2 and words in last, done.err
+    assert files(tmp_path) == {}
+
+
+def test_a_wrong_token_and_a_gateway_that_is_away_are_one_line(service, where, monkeypatch):
+    away = pup("jobs", "list", "--url", f"http://127.0.0.1:{gateways.free_port()}")
+    monkeypatch.setenv("PUP_TOKEN", "wrong")
+    wrong = pup("jobs", "list", *where)
+    monkeypatch.delenv("PUP_TOKEN")
+    none = pup("jobs", "list", *where)
+    for done, words in ((away, "no gateway"), (wrong, "bearer token"), (none, "PUP_TOKEN")):
+        assert done.code == 2 and len(done.err.splitlines()) == 1 and words in done.err
