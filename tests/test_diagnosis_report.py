@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from test_report import Page
 
 from pup.diagnosis import summary
+from pup.diagnosis.document import document
 from pup.diagnosis.drawing import draw_robot
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import WORDS
@@ -133,6 +134,28 @@ def test_every_effect_has_a_sentence(op2: Maker, effect: str) -> None:
     assert re.search(r"\d", words)
     assert not re.search(r"nan|inf\b|\de[-+]|_", words)
     assert len(words) < 200
+
+
+@pytest.mark.parametrize(
+    ("effect", "place", "name", "kind"),
+    [
+        ("coulomb_friction", "joint", "coulomb_friction", {"kind": "joint", "names": ["l_knee"]}),
+        (
+            "coulomb_friction",
+            "robot",
+            "coulomb_friction",
+            {"kind": "group", "names": ["arm", "head", "hip", "knee", "ankle"]},
+        ),
+        ("thermal_drift", "robot", "thermal_drift", {"kind": "robot", "names": ["darwin_op2"]}),
+        ("derivative_kick", "group", "unknown", {"kind": "group", "names": ["hip"]}),
+    ],
+)
+def test_the_document_speaks_the_contracts_language(
+    op2: Maker, effect: str, place: str, name: str, kind: dict[str, Any]
+) -> None:
+    """What all servos do is of all groups; what the contract has no name for is unknown."""
+    (finding,) = document(op2.missing(effect, PLACES[place]), "corrected")["findings"]
+    assert (finding["effect"], finding["place"]) == (name, kind)
 
 
 def test_every_effect_is_in_words() -> None:

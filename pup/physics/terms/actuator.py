@@ -171,7 +171,7 @@ class DerivativeKick(Term):
     effect = "derivative_kick"
     quantities = (
         Quantity("gain", "N m s/rad", 0.2, 3.0),
-        Quantity("time", "s", 0.02, 0.1, grid=(0.007, 0.02)),
+        Quantity("time", "s", 0.02, 0.1, grid=(0.007, 0.02, 0.05)),
     )
     source = "MX-28 e-manual: D 16 of firmware 1.0 is 0.15 to 0.25 N m s/rad"
     state = ("_goal",)
