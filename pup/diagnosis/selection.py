@@ -53,6 +53,8 @@ REST = 0.3
 """Share of what is more than noise at a joint that an effect explains. Many small effects make
 up for what the library does not know, and for a wrong form of what was found; a true one explains
 more."""
+SHOWN = 0.1
+"""Joints count that an effect gains this share of where it gains most."""
 ALIKE = 0.03
 """The same share where the effect is known from another place: like servos do alike."""
 MATERIAL = 0.3
@@ -236,18 +238,19 @@ class Selector:
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
     def _explains(self, before: Model, after: Model) -> bool:
-        """Whether an effect explains much of what more than noise there is where it shows most.
+        """Whether an effect explains much of what more than noise there is at one joint at least.
 
-        That is at one joint: others of its group may have troubles of their own besides.
+        Others of its group may have troubles of their own besides.
         """
         measured, newest = self.replays.measured, after.hypotheses[-1]
         own = _joints(newest.place, measured.robot)
         then, now = (
             _excess(fit, measured.channel, len(own))[own] for fit in (before.fit, after.fit)
         )
-        most = int(np.argmax(then - now))
+        gain = then - now
+        shown = gain >= SHOWN * gain.max()
         share = ALIKE if newest.effect in _effects(before.hypotheses) else REST
-        return bool((then - now)[most] > share * then[most])
+        return bool((gain > share * then)[shown].any())
 
     def blur(self, model: Model, share: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""

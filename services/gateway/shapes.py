@@ -74,7 +74,7 @@ class NewStudy(Strict):
 class Retry(Strict):
     """An attempt to make."""
 
-    attempt: Annotated[int, Field(ge=2, le=10**6)]
+    attempt: Annotated[int, Field(ge=1, le=10**6)]
 
 
 class Reason(Strict):
