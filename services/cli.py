@@ -3,7 +3,6 @@
 import argparse
 import json
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -14,7 +13,7 @@ from typing import Any
 
 from pup.errors import InputError
 from pup.robot import RobotDescription
-from services import places
+from services import places, stopping
 from services.arguments import parser
 
 DONE, FAILED, REFUSED, STOPPED = 0, 1, 2, 130
@@ -30,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verb, show = VERBS[options.name]
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # those of libraries would stand between progress lines
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, also in background
+    stopping.begin()
     try:
         shown = verb(options)
     except InputError as error:

@@ -1,4 +1,7 @@
-"""Progress on standard error: a live table on a terminal, plain lines when piped."""
+"""Progress on standard error: a live table on a terminal, plain lines when piped.
+
+Whoever tells of it also learns that the job shall stop, where a library has swallowed that.
+"""
 
 import math
 import sys
@@ -11,6 +14,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from services import stopping
 from workers.fits import Status
 
 PLAIN_SECONDS = 10.0
@@ -40,6 +44,7 @@ def stages() -> Iterator[Callable[[str, float], None]]:
     begin = time.monotonic()
 
     def tell(stage: str, share: float) -> None:
+        stopping.check()
         spent = _duration(time.monotonic() - begin)
         print(f"{stage}: {share:.0%} after {spent}", file=sys.stderr, flush=True)
 
@@ -57,6 +62,7 @@ def counted(job: str) -> Iterator[Told]:
     begin, live = time.monotonic(), sys.stderr.isatty()
 
     def tell(done: int, total: int, note: str = "", share: float | None = None) -> None:
+        stopping.check()
         line = f"{job}: {done}/{total} cases"
         if share and done < total:
             left = (time.monotonic() - begin) * (1 - share) / share
@@ -78,6 +84,7 @@ def trained() -> Iterator[Callable[[dict[str, Any], int], None]]:
     live, last, first = sys.stderr.isatty(), -math.inf, None
 
     def tell(row: dict[str, Any], steps: int) -> None:
+        stopping.check()
         nonlocal last, first
         before = time.monotonic()
         first = first or (before, row["steps"])
@@ -110,6 +117,7 @@ class _Clock:
 
     def told(self, stage: str, statuses: Sequence[Status]) -> str:
         """How far a stage is, in words."""
+        stopping.check()
         now, share = time.monotonic(), _share(statuses)
         if stage != self.stage:
             self.stage, self.begin, self.first = stage, now, share
