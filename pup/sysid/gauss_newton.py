@@ -110,9 +110,8 @@ def least_squares(
         enough = cost - tolerance * cost
         for factors in (DAMPINGS, HEAVIER * DAMPINGS):
             trials = _trial_steps(jacobian, value, at, damping * factors, prior)
-            values = residuals(trials)
+            values, costs = _tried(residuals, trials, prior)
             replays += len(trials)
-            costs = [prior.cost(v, t) for v, t in zip(values, trials, strict=True)]
             pick = int(np.argmin(costs))
             if costs[pick] < enough:
                 break
@@ -220,22 +219,20 @@ def _best_parts(
 
     A kink that one parameter meets holds a whole step back; the others go on without it.
     """
-
-    def tried(steps: Array) -> tuple[Array, Array, list[float]]:
-        points = np.clip(at + steps, 0.0, 1.0)
-        values = residuals(points)
-        return points, values, [prior.cost(v, t) for v, t in zip(values, points, strict=True)]
-
-    points, values, costs = tried(parts)
+    points = np.clip(at + parts, 0.0, 1.0)
+    values, costs = _tried(residuals, points, prior)
     helping = np.array(costs) < cost
     if helping.sum() < 2:
         return points, values, costs
-    together = tried(parts[helping].sum(axis=0)[None])
-    return (
-        np.vstack([points, together[0]]),
-        np.vstack([values, together[1]]),
-        costs + together[2],
-    )
+    together = np.clip(at + parts[helping].sum(axis=0), 0.0, 1.0)[None]
+    value, least = _tried(residuals, together, prior)
+    return np.vstack([points, together]), np.vstack([values, value]), costs + least
+
+
+def _tried(residuals: Residuals, points: Array, prior: _Prior) -> tuple[Array, list[float]]:
+    """Residuals and costs of points."""
+    values = residuals(points)
+    return values, [prior.cost(v, p) for v, p in zip(values, points, strict=True)]
 
 
 def _step_within(system: Array, gradient: Array, at: Array) -> Array:

@@ -64,9 +64,10 @@ def confidence_at(problem: Problem, unit: Array) -> Confidence:
     def weighted(candidates: Array) -> Array:
         return problem.errors(candidates)[0]
 
-    error, blocks = problem.errors(unit[None])
+    fitted = problem.replay(unit[None])
+    error, blocks = problem.loss.weighted_errors(fitted)
     jacobian = differences(weighted, unit, error[0], STEP)
-    r = _lag_one(problem.loss.errors(problem.replay(unit[None]))[0][0], problem)
+    r = _lag_one(problem.loss.errors(fitted)[0][0], problem)
     seen = Told(error[0], jacobian, blocks, problem.loss.ticks, (1 + r) / (1 - r))
     starts = _starts(problem, unit, error[0])
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads
