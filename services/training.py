@@ -73,7 +73,7 @@ class Options:
     steps: int = 10_000_000
     seed: int = 0
     simulations: int = 256
-    length: int = 24
+    length: int = 80
     learning: Learning = field(default_factory=Learning)
     runners: int = 0
     start: Path | None = None

@@ -42,9 +42,9 @@ class Learning:
       threads: of torch.
     """
 
-    epochs: int = 4
-    minibatch: int = 1536
-    rate: float = 1e-3
+    epochs: int = 5
+    minibatch: int = 256
+    rate: float = 3e-4
     schedule: Literal["linear", "adaptive", "constant"] = "linear"
     divergence: float = 0.01
     gradient: float = 1.0
