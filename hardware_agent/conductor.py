@@ -19,7 +19,7 @@ from hardware_agent.distance import Distance, DistanceError
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.rollout import Rollout, recording_of
-from hardware_agent.trials import TrialBook
+from hardware_agent.trials import End, TrialBook
 from pup.errors import InputError
 from pup.files import sha256
 from pup.robot import RobotDescription
@@ -277,9 +277,8 @@ class Conductor:
         assert self._assign is not None
         recording, digest = self._recording or (None, None)
         walked = self._ended.time if self._ended else None
-        finished = self._book.finish(
-            self._assign, outcome, reason, distance, walked, recording, digest
-        )
+        end = End(outcome, reason, distance, walked, recording, digest)
+        finished = self._book.finish(self._assign, end)
         if recording is not None and self._settings.link.upload:
             self._send(*self._chunks(recording))
         self._send(finished)

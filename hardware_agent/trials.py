@@ -63,6 +63,27 @@ class Trial:
     acknowledged: bool = False
 
 
+@dataclass(frozen=True)
+class End:
+    """How a trial ended.
+
+    Attributes:
+      outcome: in a word.
+      reason: in words, for people.
+      distance: m; None where none was measured.
+      time: until the fall or the end, s; None where the robot did not move.
+      recording: id of the recording, if there is one.
+      digest: SHA-256 of its file.
+    """
+
+    outcome: Outcome
+    reason: str
+    distance: float | None = None
+    time: float | None = None
+    recording: str | None = None
+    digest: str | None = None
+
+
 class TrialBook:
     """All trials of a journal.
 
@@ -79,7 +100,7 @@ class TrialBook:
             self._replay(entry)
         for key, trial in list(self._trials.items()):
             if trial.running and trial.finished is None:
-                self._finish(key, Outcome.ABORTED, RESTARTED)
+                self._finish(key, End(Outcome.ABORTED, RESTARTED))
 
     @property
     def current(self) -> Assign | None:
@@ -143,7 +164,7 @@ class TrialBook:
         if known.running and known.finished is None:
             return [], True
         if known.finished is None:
-            self._finish(key, Outcome.ABORTED, "cancelled")
+            self._finish(key, End(Outcome.ABORTED, "cancelled"))
         return list(self._standing(key)), False
 
     def acknowledged(self, message: Acknowledge) -> None:
@@ -165,21 +186,12 @@ class TrialBook:
         self._trials[key] = replace(self._trials[key], running=True)
         return Running(*key, self._trials[key].fence)
 
-    def finish(
-        self,
-        assign: Assign,
-        outcome: Outcome,
-        reason: str,
-        distance: float | None = None,
-        time: float | None = None,
-        recording: str | None = None,
-        digest: str | None = None,
-    ) -> Finished:
-        """The trial is over; see `Finished`. One that is over already keeps its end."""
+    def finish(self, assign: Assign, end: End) -> Finished:
+        """The trial is over. One that is over already keeps its end."""
         key = (assign.trial, assign.attempt)
         known = self._trials[key]
         if known.finished is None:
-            self._finish(key, outcome, reason, distance, time, recording, digest)
+            self._finish(key, end)
         finished = self._trials[key].finished
         assert finished is not None
         return finished
@@ -198,11 +210,8 @@ class TrialBook:
             return True
         if current.trial != assign.trial or self.running:
             return False
-        self._finish(
-            (current.trial, current.attempt),
-            Outcome.ABORTED,
-            f"superseded by attempt {assign.attempt}",
-        )
+        reason = f"superseded by attempt {assign.attempt}"
+        self._finish((current.trial, current.attempt), End(Outcome.ABORTED, reason))
         return True
 
     def _standing(self, key: Key) -> Iterator[Body]:
@@ -215,18 +224,17 @@ class TrialBook:
         else:
             yield Accepted(*key, trial.fence)
 
-    def _finish(
-        self,
-        key: Key,
-        outcome: Outcome,
-        reason: str,
-        distance: float | None = None,
-        time: float | None = None,
-        recording: str | None = None,
-        digest: str | None = None,
-    ) -> None:
-        fence = self._trials[key].fence
-        finished = Finished(*key, fence, outcome, distance, time, reason, recording, digest)
+    def _finish(self, key: Key, end: End) -> None:
+        finished = Finished(
+            *key,
+            self._trials[key].fence,
+            end.outcome,
+            end.distance,
+            end.time,
+            end.reason,
+            end.recording,
+            end.digest,
+        )
         self._record(key, replace(self._trials[key], finished=finished))
 
     def _record(self, key: Key, trial: Trial) -> None:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware_agent.journal import Journal
-from hardware_agent.trials import RESTARTED, TrialBook
+from hardware_agent.trials import RESTARTED, End, TrialBook
 from pup.errors import InputError
 from pup.wire import (
     Accepted,
@@ -102,7 +102,7 @@ class World:
                 self.forbidden.add(key)
             self.outbox += answers
             if end and self.moving is not None:
-                self.outbox.append(self.book.finish(self.moving, Outcome.ABORTED, "halted"))
+                self.outbox.append(self.book.finish(self.moving, End(Outcome.ABORTED, "halted")))
                 self.moving = None
         elif isinstance(body, Acknowledge):
             self.book.acknowledged(body)
@@ -119,7 +119,8 @@ class World:
     def stand(self) -> None:
         """It has ended."""
         if self.moving is not None:
-            self.outbox.append(self.book.finish(self.moving, Outcome.SUCCEEDED, "fell", 0.5, 3.0))
+            end = End(Outcome.SUCCEEDED, "fell", 0.5, 3.0)
+            self.outbox.append(self.book.finish(self.moving, end))
             self.moving = None
 
     def gateway(self, body: Body) -> None:
@@ -254,7 +255,7 @@ def test_an_older_fence_gets_no_answer_and_a_newer_one_is_taken_over(tmp_path: P
     assert trials.assigned(assign(fence=4)) == [Accepted("t", 1, 4)]
     trials.begin(trials.current or assign())
     assert trials.assigned(assign(fence=5)) == [Running("t", 1, 5)]
-    told = trials.finish(assign(), Outcome.SUCCEEDED, "fell", 0.4, 2.0)
+    told = trials.finish(assign(), End(Outcome.SUCCEEDED, "fell", 0.4, 2.0))
     assert told.fence == 5
     trials.acknowledged(Acknowledge("m", "t", 1, 5))
     assert trials.owed == []
@@ -289,7 +290,7 @@ def test_a_journal_survives_being_cut_off_anywhere(cut: int) -> None:
         trials = book(path)
         trials.assigned(assign())
         trials.begin(assign())
-        trials.finish(assign(), Outcome.SUCCEEDED, "fell", 0.4, 2.0)
+        trials.finish(assign(), End(Outcome.SUCCEEDED, "fell", 0.4, 2.0))
         data = (path / "journal").read_bytes()
         (path / "journal").write_bytes(data[: max(1, len(data) - cut)])
         again = book(path)
