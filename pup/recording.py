@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import write_atomic
+from pup.recording_file import KEY, read_columns
 from pup.recording_rules import (
     SCHEMA,
     check_extra,
@@ -31,15 +32,6 @@ from pup.recording_rules import (
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
-
-KEY = b"pup.recording"
-
-# A recording of an hour at 1 kHz with 6 columns has 22 million cells; real ones have thousands.
-MAX_FILE = 2**30  # bytes
-MAX_CELLS = 20_000_000
-MAX_COLUMNS = 4096
-MAX_UNPACKED = 2**31  # bytes, as the footer tells
-MAX_METADATA = 2**20  # bytes
 
 _CORE = ("time", "target", "position")
 
@@ -185,7 +177,7 @@ class Recording:
           InputError: the file breaks a rule; the message names file, column and row.
         """
         try:
-            metadata, columns = _read_parquet(path)
+            metadata, columns = read_columns(path)
             return from_columns(metadata, columns)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
@@ -302,63 +294,3 @@ def _frozen(name: str, values: object) -> Array:
     array[np.isnan(array)] = np.nan
     array.setflags(write=False)
     return array
-
-
-def _read_parquet(path: Path) -> tuple[object, dict[str, Array]]:
-    """Metadata and columns of a file, nulls as NaN; the footer is judged before data is read."""
-    try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise InputError("not a file")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})") from error
-    if size > MAX_FILE:
-        raise InputError(f"{size} bytes; a recording has at most {MAX_FILE}")
-    try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            _check_footer(file)
-            columns = {}
-            table = file.read(use_threads=False)
-            for name in table.column_names:
-                column = table.column(name)
-                values = column.to_numpy().astype(np.float64)
-                missing = column.is_null().to_numpy()
-                for row in np.flatnonzero(~np.isfinite(values) & ~missing):
-                    raise InputError(
-                        f"column {name!r}, row {row}: {values[row]}; a missing sample must be null"
-                    )
-                columns[name] = values
-            return _parse(file.schema_arrow.metadata[KEY]), columns
-    except InputError:
-        raise
-    except Exception as error:  # damaged files make pyarrow raise nearly anything
-        told = " ".join(str(error).split())[:200]
-        raise InputError(f"not a readable Parquet file ({told})") from error
-
-
-def _check_footer(file: Any) -> None:
-    footer, schema = file.metadata, file.schema_arrow
-    unpacked = sum(footer.row_group(i).total_byte_size for i in range(footer.num_row_groups))
-    rows, columns = footer.num_rows, footer.num_columns
-    if columns > MAX_COLUMNS or rows * columns > MAX_CELLS or unpacked > MAX_UNPACKED:
-        raise InputError(
-            f"{rows} rows of {columns} columns, {unpacked} bytes unpacked; a recording has at most "
-            f"{MAX_COLUMNS} columns, {MAX_CELLS} cells and {MAX_UNPACKED} bytes"
-        )
-    for name in schema.names:
-        if schema.names.count(name) > 1:
-            raise InputError(f"column {name!r} stands twice")
-        if schema.field(name).type != pa.float64():
-            raise InputError(f"column {name!r} is {schema.field(name).type}; it must be float64")
-    told = (schema.metadata or {}).get(KEY)
-    if told is None:
-        raise InputError("no metadata 'pup.recording': not a recording; see `pup import`")
-    if len(told) > MAX_METADATA:
-        raise InputError(f"metadata 'pup.recording' has {len(told)} bytes, over {MAX_METADATA}")
-
-
-def _parse(text: bytes) -> object:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"metadata 'pup.recording' is not JSON ({error})") from error

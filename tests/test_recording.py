@@ -15,6 +15,7 @@ from recordings import COLUMNS, make, write_table
 
 from pup.errors import InputError
 from pup.recording import Recording, load_recordings
+from pup.recording_file import read_header
 from pup.robot import RobotDescription
 
 
@@ -118,6 +119,23 @@ def test_writing_and_reading_keeps_everything(tmp_path_factory: Any, recording: 
     back = Recording.read(path)
     assert same(back, recording)
     assert back.digest == recording.digest
+
+
+def test_the_header_tells_what_the_samples_do(tmp_path: Path) -> None:
+    recording = make(time=[0.0, 0.1, 0.4])
+    recording.write(tmp_path / "r1.parquet")
+    header = read_header(tmp_path / "r1.parquet")
+    assert header.metadata == recording.metadata() and header.joints == recording.joints
+    assert header.columns == tuple(name for name, _ in recording.columns())
+    assert (header.rows, header.cells) == (3, 3 * len(header.columns))
+    assert header.duration == pytest.approx(0.4) and header.rate == pytest.approx(1 / 0.2)
+
+
+@pytest.mark.parametrize("time", [[0.0, 0.1, 0.1, 0.2], [0.0, None, 0.1, 0.2]])
+def test_the_header_of_a_broken_clock_is_refused(tmp_path: Path, time: list[Any]) -> None:
+    file = write_table(tmp_path / "broken.parquet", COLUMNS | {"time": time})
+    with pytest.raises(InputError, match=r"broken\.parquet: column 'time', row"):
+        read_header(file)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import COLUMNS, METADATA, make, write_table
 
-from pup import recording as module
+from pup import recording_file as module
 from pup.errors import InputError
 from pup.recording import KEY, Recording
 
