@@ -1,6 +1,6 @@
 """Scoring verdicts against a revealed key."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,11 @@ diagnosis does not tell the refitted nominal model."""
 
 
 def score_set(
-    folder: Path, key: Path, diagnoses: Path, replay: Replay | None = None
+    folder: Path,
+    key: Path,
+    diagnoses: Path,
+    replay: Replay | None = None,
+    only: Collection[str] | None = None,
 ) -> dict[str, Any]:
     """Score a set.
 
@@ -45,6 +49,7 @@ def score_set(
       key: its key.
       diagnoses: folder with `case_<id>/diagnosis.json` for every case.
       replay: how to replay a corrected robot; without it there is no oracle ratio.
+      only: ids of the cases to be scored; all of the set where None.
 
     Returns:
       The scores, as JSON values. `all` and the robots' scores leave the stratum `weak` out, which
@@ -53,7 +58,7 @@ def score_set(
     Raises:
       InputError: the key or the set is not the one committed to, or there is no diagnosis at all.
     """
-    truths = verify(folder, key)["cases"]
+    truths = [t for t in verify(folder, key)["cases"] if only is None or t["id"] in only]
     if not any(diagnoses.glob("case_*/diagnosis.json")):
         raise InputError(f"{diagnoses}: no case_<id>/diagnosis.json in it")
     robots = {name: RobotDescription.load(name) for name in {t["robot"] for t in truths}}

@@ -50,9 +50,9 @@ def markdown(scores: Mapping[str, Any]) -> str:
         "|---|---|---|",
         *(_row(told, scores["nulls"][name]) for name, told in NULL_ROWS.items()),
         "",
-        *_few("stratum", scores["per_stratum"]),
+        *few("stratum", scores["per_stratum"]),
         "",
-        *_few("robot", scores["per_robot"]),
+        *few("robot", scores["per_robot"]),
         "",
         f"## Failures: {len(scores['failures'])}",
         "",
@@ -78,11 +78,11 @@ def _engine(told: Mapping[str, Any] | None) -> str:
 def _row(told: str, value: Mapping[str, Any]) -> str:
     interval = value.get("ci95")
     limits = f"{interval[0]:.3f} to {interval[1]:.3f}" if interval else ""
-    return f"| {told} | {_cell(value)} | {limits} |"
+    return f"| {told} | {cell(value)} | {limits} |"
 
 
-def _cell(value: Mapping[str, Any]) -> str:
-    """One score in a few characters."""
+def cell(value: Mapping[str, Any]) -> str:
+    """One score of `score_set` in a few characters."""
     if not value["of"]:
         return "-"
     if "rate" in value:
@@ -92,13 +92,18 @@ def _cell(value: Mapping[str, Any]) -> str:
     return f"{value['mean']:.3g}, median {value['median']:.3g} ({value['of']})"
 
 
-def _few(what: str, groups: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A line per group with the main scores."""
+def few(what: str, groups: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A table with a line per group and the main scores.
+
+    Args:
+      what: heads the column of groups.
+      groups: their scores, those of nulls among them or under `nulls`.
+    """
     names = (*FEW, "false_positives")
     titles = [{**ROWS, **NULL_ROWS}[name] for name in names]
     lines = [f"| {what} | {' | '.join(titles)} |", "|---" * (len(names) + 1) + "|"]
     for group, scores in groups.items():
         flat = {**scores.get("nulls", {}), **scores}
-        cells = [_cell(flat[name]) if name in flat else "-" for name in names]
+        cells = [cell(flat[name]) if name in flat else "-" for name in names]
         lines.append(f"| {group} | {' | '.join(cells)} |")
     return lines
