@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.physics.rest import at_rest, ticks_at_rest
 from pup.physics.rotations import CONJUGATE, multiply
 from pup.recording import Recording
 from pup.robot import RobotDescription
@@ -165,13 +166,12 @@ def starting_qpos(
 
 
 def first_tilt(robot: RobotDescription, model: Model, recording: Recording) -> Array:
-    """The torso's orientation by the IMU's first roll and pitch, shape (4,); NaN without them."""
+    """The torso's orientation by the IMU's roll and pitch at the start, (4,); NaN without them."""
+    ticks = ticks_at_rest(recording)
     roll, pitch = (
-        _first_known(recording.extras.get(f"imu/{angle}")) for angle in ("roll", "pitch")
+        _first_known(recording.extras.get(f"imu/{angle}"), ticks) for angle in ("roll", "pitch")
     )
-    return tilted(
-        robot, model, np.nan if roll is None else roll, np.nan if pitch is None else pitch
-    )
+    return tilted(robot, model, roll, pitch)
 
 
 def tilted(robot: RobotDescription, model: Model, roll: float, pitch: float) -> Array:
@@ -206,10 +206,12 @@ def standing_qpos(robot: RobotDescription, model: Model, position: Array, torso:
     return np.array(data.qpos)
 
 
-def _first_known(values: Array | None) -> float | None:
+def _first_known(values: Array | None, ticks: int) -> float:
+    """The mean of the readings at rest, or else the first one there is; NaN without any."""
     if values is None or np.isnan(values).all():
-        return None
-    return float(values[np.argmax(~np.isnan(values))])
+        return np.nan
+    resting = float(at_rest(values, ticks))
+    return float(values[np.argmax(~np.isnan(values))]) if np.isnan(resting) else resting
 
 
 def _from_roll_pitch(roll: float, pitch: float) -> Array:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.parameters import Candidates
+from pup.physics.rest import at_rest, ticks_at_rest
 from pup.recording import Recording
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ class Schedule:
       held: target from each tick on, shape (n_ticks, n_joints), rad.
       power: share of each sub-step, from half a one before to half a one after its
         beginning, with the torque on, shape (n_steps,).
-      start: first joint position, shape (n_joints,), rad.
+      start: joint positions to start from, shape (n_joints,), rad.
       start_velocity: first joint velocity, shape (n_joints,), rad/s.
       tick_step: sub-step in which each tick falls, shape (n_ticks,).
       tick_fraction: where in it, 0 to 1, shape (n_ticks,).
@@ -71,7 +72,7 @@ def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Sc
         time=elapsed,
         held=target,
         power=_mean_over_steps(elapsed, power, grid)[:, 0],
-        start=_start(recording.position[:, order], target),
+        start=_start(recording, order, target),
         start_velocity=np.nan_to_num(np.array(speeds)),
         tick_step=step,
         tick_fraction=np.clip(where - step - 1e-9, 0.0, 1.0),
@@ -87,19 +88,22 @@ def _held(values: Array) -> Array:
     return np.asarray(np.take_along_axis(values, np.maximum(rows, first), axis=0))
 
 
-def _start(position: Array, target: Array) -> Array:
-    """First positions, shape (n_joints,).
+def _start(recording: Recording, order: Sequence[int], target: Array) -> Array:
+    """Positions to start from, shape (n_joints,): the mean of a rest, or the first ones.
 
     Where the first reading is missing, the next one counts as long as no target has changed
     before it; else the joint stood at its first target.
     """
+    position = recording.position[:, order]
+    resting = at_rest(position, ticks_at_rest(recording))
     read = np.argmax(~np.isnan(position), axis=0)
     joints = np.arange(position.shape[1])
     moved = np.argmax(
         np.append(target != target[0], np.ones((1, len(joints)), bool), axis=0), axis=0
     )
     known = ~np.isnan(position[read, joints]) & (read <= moved)
-    return np.asarray(np.where(known, position[read, joints], target[0]))
+    first = np.where(known, position[read, joints], target[0])
+    return np.asarray(np.where(np.isnan(resting), first, resting))
 
 
 def _mean_over_steps(time: Array, held: Array, grid: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pup.physics.rest import ticks_at_rest
 from pup.recording import Recording
 from pup.sysid.excitation import joint_units
 from pup.sysid.gauss_newton import Confidence, confidence, differences
@@ -165,15 +166,17 @@ def _starts(problem: Problem, unit: Array, error: Array) -> list[Array]:
 
 
 def _moved(recording: Recording, name: str, by: float) -> Recording:
-    """A recording with its first reading of a joint or of the IMU moved."""
+    """A recording with the reading of a joint or of the IMU moved that its replay starts from."""
+    ticks = ticks_at_rest(recording)
+    by /= np.sqrt(ticks)
     if name in recording.joints:
         position = recording.position.copy()
-        position[0, recording.joints.index(name)] += by
+        position[:ticks, recording.joints.index(name)] += by
         return replace(recording, position=position)
     if name not in recording.extras:
         return recording
     values = recording.extras[name].copy()
-    values[0] += by
+    values[:ticks] += by
     return replace(recording, extras={**recording.extras, name: values})
 
 

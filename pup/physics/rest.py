@@ -1,0 +1,57 @@
+"""Where a replay starts: the first reading, or the mean of those of a robot that rests.
+
+On the ground a start's noise does not die out as it does where a fixed torso holds the joints: it
+grows with every impact, and a fit pays for it with parameters. Most motions begin at rest.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.recording import Recording
+
+Array = NDArray[np.float64]
+
+FEWEST = 4
+"""Ticks of rest worth a mean: two in each half that are compared."""
+DRIFT = 0.004
+"""By how much the means of a rest's halves may differ, rad: under three steps of a 12-bit encoder. What
+drifts less is hardly misread by its mean."""
+
+
+def ticks_at_rest(recording: Recording) -> int:
+    """Ticks at the beginning in which a robot on the ground is told nothing and does not move.
+
+    Args:
+      recording: its targets tell how long nothing is asked, its readings whether nothing happens.
+
+    Returns:
+      Their number; 1 where the robot hangs, where the first reading alone must do, or where it
+      moves from the start.
+    """
+    if recording.support != "ground":
+        return 1
+    moved = (recording.target[1:] != recording.target[:-1]) & ~np.isnan(recording.target[1:])
+    asked = moved.any(axis=1)
+    still = int(np.argmax(asked)) + 1 if asked.any() else len(recording.time)
+    readings = np.column_stack([recording.position, *_tilts(recording)])[:still]
+    readings = readings[:, ~np.isnan(readings).any(axis=0)]
+    if still < FEWEST or _drifts(readings):
+        return 1
+    return still
+
+
+def at_rest(values: Array, ticks: int) -> Array:
+    """Mean of the known readings at rest, shape (n,); NaN where none is known."""
+    known = ~np.isnan(values[:ticks])
+    total = np.where(known, values[:ticks], 0.0).sum(axis=0)
+    return np.asarray(np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan))
+
+
+def _tilts(recording: Recording) -> list[Array]:
+    return [v for n in ("imu/roll", "imu/pitch") if (v := recording.extras.get(n)) is not None]
+
+
+def _drifts(readings: Array) -> bool:
+    """Whether the two halves of a rest (n_ticks, n) differ."""
+    before, after = (half.mean(axis=0) for half in np.array_split(readings, 2))
+    return bool((np.abs(after - before) > DRIFT).any())

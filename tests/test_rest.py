@@ -1,0 +1,85 @@
+"""Where a replay starts: the mean of a robot that rests on the ground, else its first reading."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from recordings import make
+
+from pup.physics.model import compile_model, first_tilt
+from pup.physics.rest import ticks_at_rest
+from pup.physics.simulator import schedule
+from pup.recording import Recording
+from pup.robot import RobotDescription
+
+REST, TICKS = 15, 40
+NOISE = 0.002  # rad
+
+
+def resting(support: str, seed: int = 0) -> Recording:
+    """Half a second at rest, read with noise, and then a command."""
+    rng = np.random.default_rng(seed)
+    target = np.zeros((TICKS, 2))
+    target[REST:] = 0.5
+    return make(
+        support=support,
+        time=np.arange(TICKS) / 30,
+        target=target,
+        position=0.3 + rng.normal(0, NOISE, (TICKS, 2)),
+    )
+
+
+def test_the_readings_of_a_rest_are_averaged() -> None:
+    starts = []
+    for seed in range(200):
+        recording = resting("ground", seed)
+        assert ticks_at_rest(recording) == REST
+        starts.append(schedule(recording, ("a", "b"), 0.002).start)
+    np.testing.assert_allclose(np.std(starts), NOISE / np.sqrt(REST), rtol=0.1)
+
+
+def test_a_robot_that_hangs_starts_at_its_first_reading() -> None:
+    """Nothing grows there, and a servo at 200 Hz may have begun to fall."""
+    recording = resting("suspended")
+    assert ticks_at_rest(recording) == 1
+    np.testing.assert_array_equal(
+        schedule(recording, ("a", "b"), 0.002).start, recording.position[0]
+    )
+
+
+def test_a_robot_that_moves_from_the_start_has_no_rest() -> None:
+    recording = resting("ground")
+    sinking = recording.position - 0.05 * np.linspace(0, 1, TICKS)[:, None] * [1, 0]
+    assert ticks_at_rest(replace(recording, position=sinking)) == 1
+
+
+def test_a_command_at_once_leaves_no_rest() -> None:
+    recording = resting("ground")
+    target = recording.target.copy()
+    target[1:, 0] += 0.1
+    assert ticks_at_rest(replace(recording, target=target)) == 1
+
+
+def test_readings_that_are_missing_are_left_out() -> None:
+    recording = resting("ground")
+    position = recording.position.copy()
+    position[2:5, 0] = np.nan
+    position[:, 1] = np.nan
+    position[-1, 1] = 7.0  # known only after a command: the joint stood at its target
+    start = schedule(replace(recording, position=position), ("a", "b"), 0.002).start
+    known: NDArray[np.float64] = position[:REST, 0]
+    np.testing.assert_allclose(start, [np.nanmean(known), 0.0])
+
+
+def test_the_torso_is_as_its_imu_says_on_average() -> None:
+    robot = RobotDescription.load("darwin_op2")
+    model = compile_model(robot, "ground")
+    tilts = {
+        f"imu/{angle}": at + np.random.default_rng(2).normal(0, NOISE, TICKS)
+        for angle, at in (("roll", 0.1), ("pitch", -0.2))
+    }
+    still = replace(resting("ground"), extras=tilts)
+    mean = {n: np.full(TICKS, v[:REST].mean()) for n, v in tilts.items()}
+    np.testing.assert_allclose(
+        first_tilt(robot, model, still), first_tilt(robot, model, replace(still, extras=mean))
+    )
