@@ -1,0 +1,329 @@
+"""What each verb of the command line does: options in, what it prints out.
+
+Imports of what takes long stand inside the verbs: `pup --help` needs none of it.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+from pup.robot import RobotDescription
+from services import places
+
+
+def _run(options: argparse.Namespace) -> dict[str, Any]:
+    _quiet_torch()
+    from pup.recording import load_recordings
+    from pup.sysid.accuracy import JointUnits
+    from services.pipeline import Means, Mission, default_recordings, run
+    from services.progress import reporter, trained
+
+    robot = RobotDescription.load(options.robot)
+    given = options.recordings
+    recordings = load_recordings([given], robot) if given else default_recordings(robot)
+    budget = _budget(options, robot)
+    mission = Mission(budget, options.train_steps, options.trials, options.repeats)
+    means = Means(
+        lambda: places.fits(options),
+        lambda: places.training(options),
+        reporter,
+        trained,
+        _tell,
+        places.cores(options),
+    )
+    with _folder(options.out) as out:
+        stages = run(robot, recordings, mission, out, means)
+    return stages | {
+        "report": str(out / "report.html"),
+        "unit": JointUnits.of(robot, recordings).position,
+    }
+
+
+def _presysid(options: argparse.Namespace) -> dict[str, Any]:
+    from pup.recording import load_recordings
+    from pup.sysid.accuracy import JointUnits
+    from services.presysid import identify
+    from services.progress import reporter
+
+    robot = RobotDescription.load(options.robot)
+    recordings = load_recordings(options.recordings, robot)
+    with _folder(options.out) as out, places.fits(options) as runner, reporter() as progress:
+        bounds = identify(
+            robot, recordings, _budget(options, robot), out, runner, progress, places.cores(options)
+        )
+    return {
+        "presysid": bounds.document(),
+        "report": str(out / "report.html"),
+        "unit": JointUnits.of(robot, recordings).position,
+    }
+
+
+def _train(options: argparse.Namespace) -> dict[str, Any]:
+    if find_spec("torch") is None or find_spec("gymnasium") is None:
+        raise InputError("training needs PyTorch and RLlib; install pup[learn]")
+    _quiet_torch()
+    from services.progress import trained
+    from services.tracking import check
+    from services.training import train, training_options
+
+    check(tuple(options.track))
+    robot = RobotDescription.load(options.robot)
+    with _folder(options.out) as out, trained() as told:
+        wanted = training_options(options)
+        return train(robot, options.bounds, wanted, out, lambda: places.training(options), told)
+
+
+def _quiet_torch() -> None:
+    """Torch's threads sleep while they wait: spinning takes the cores from the simulations."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def _transfer(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services import transfer
+
+    simulated = transfer.read_simulated(options.simulated) if options.simulated else None
+    wanted = transfer.Wanted(
+        options.policy,
+        options.study,
+        options.url,
+        transfer.token_of(options.token_file),
+        transfer.settings_of(options),
+        simulated,
+    )
+    with _folder(options.out) as out:
+        return transfer.transfer(wanted, out, lambda line: print(line, file=sys.stderr, flush=True))
+
+
+def _submit(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services.submit import submit
+
+    return submit(options)
+
+
+def _jobs(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services.submit import jobs
+
+    if options.action != "fetch":
+        return jobs(options)
+    with _folder(options.out):
+        return jobs(options)
+
+
+def _serve(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    from services.gateway import verb
+
+    return verb.serve(options)
+
+
+def _service() -> None:
+    wanted = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "botorch", "httpx")
+    if missing := [name for name in wanted if find_spec(name) is None]:
+        raise InputError(f"the service needs {missing[0]}; install pup[service]")
+
+
+def _replay(options: argparse.Namespace) -> dict[str, Any]:
+    if bool(options.recordings) == bool(options.policy):
+        raise InputError("give either recordings or --policy DIR")
+    if options.policy and options.engine != "mujoco":
+        raise InputError(f"--engine {options.engine} replays recordings; a policy walks in mujoco")
+    if options.policy:
+        return _walk(options)
+    from pup.physics.engine import Engine
+    from pup.recording import load_recordings
+    from services.replay import replay
+
+    robot = RobotDescription.load(options.robot)
+    recordings = load_recordings(options.recordings, robot)
+    with _folder(options.out) as out:
+        cores, engine = places.cores(options), Engine(options.engine)
+        return replay(robot, recordings, options.bounds, out, cores, engine)
+
+
+def _walk(options: argparse.Namespace) -> dict[str, Any]:
+    from services.walk import Shown, walk
+
+    robot = RobotDescription.load(options.robot)
+    shown = Shown(
+        options.policy,
+        options.bounds,
+        options.eta,
+        options.episodes,
+        options.landscape,
+        options.seed,
+    )
+    with _folder(options.out) as out:
+        return walk(robot, shown, out, places.cores(options))
+
+
+def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
+    from pup.recording import load_recordings
+    from services.diagnosis import run_diagnosis
+    from services.progress import stages
+
+    if options.rivals and find_spec("torch") is None:
+        raise InputError(
+            "--rivals needs PyTorch, which is not installed; leave it out or install pup[learn]"
+        )
+    robot = RobotDescription.load(options.robot)
+    recordings = load_recordings(options.recordings, robot)
+    with _folder(options.out) as out, places.replays(options) as where, stages() as progress:
+        return run_diagnosis(
+            robot, recordings, out, where, progress, options.seed, rivals=options.rivals
+        )
+
+
+def _import(options: argparse.Namespace) -> dict[str, Any]:
+    from pup.importers import ImportOptions, import_recordings
+    from pup.recording import write_recordings
+
+    robot = RobotDescription.load(options.robot) if options.robot else None
+    read = import_recordings(
+        options.format,
+        options.paths,
+        robot,
+        ImportOptions(
+            robot=options.robot_name,
+            motion=options.motion,
+            support=options.support,
+            source=options.source,
+            setup=_setup(options.setup),
+            notes=options.notes,
+            joints=tuple(options.joints.split(",")) if options.joints else (),
+            state_topic=options.state_topic,
+            command_topic=options.command_topic,
+        ),
+    )
+    with _folder(options.out) as out:
+        return {"recordings": [str(file) for file in write_recordings(read, out)]}
+
+
+def _export(options: argparse.Namespace) -> dict[str, Any]:
+    from services.export import export
+
+    if options.bounds and not options.robot:
+        raise InputError("--bounds needs --robot, which is simulated; give both or none")
+    robot = RobotDescription.load(options.robot) if options.robot else None
+    wanted = options.format, options.recordings, robot, options.bounds, options.fps
+    with _folder(options.out) as out:
+        return export(*wanted, out, places.cores(options))
+
+
+def _record(options: argparse.Namespace) -> dict[str, Any]:
+    from pup.sysid.virtual import SensorNoise, record
+
+    if not options.virtual:
+        raise InputError("only virtual robots can be recorded by now; add --virtual")
+    robot = RobotDescription.load(options.robot)
+    truth = options.truth
+    if truth is not None and truth.is_dir():
+        raise InputError(f"{truth}: is a folder; --truth needs a file")
+    with _folder(options.out) as out, _folder(truth.parent if truth else out):
+        made = record(
+            robot,
+            options.motions,
+            out,
+            options.seed,
+            actuator=options.actuator or robot.actuator,
+            noise=SensorNoise(0.0, 0.0, 0.0, 0.0) if options.noiseless else SensorNoise(),
+            repeats=options.repeats,
+            truth=truth,
+        )
+    return {"recordings": [str(out / f"{r.id}.parquet") for r in made]}
+
+
+def _blind(options: argparse.Namespace) -> dict[str, Any]:
+    from services import blind
+
+    with _folder(blind.folder_of(options)):
+        return blind.ACTIONS[options.action](options)
+
+
+def _virtual_robot(options: argparse.Namespace) -> dict[str, Any]:
+    from services.virtual_robot import Wanted, serve
+
+    given = ("seed", "protocol", "speed", "period", "link", "imu", "side")
+    wanted = Wanted.of(**{name: getattr(options, name) for name in given})
+    return serve(RobotDescription.load(options.robot), wanted, _tell)
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
+    from services.presysid import Options
+
+    return Options(
+        actuator=options.actuator or robot.actuator,
+        generations=options.generations,
+        population=options.population,
+        subsets=options.subsets,
+        subset_generations=options.subset_generations,
+        fraction=options.fraction,
+        folds=options.folds,
+        compare=not options.no_comparison,
+        fixed_network=options.fixed_network,
+        seed=options.seed,
+    )
+
+
+@contextmanager
+def _folder(path: Path) -> Iterator[Path]:
+    """A folder that can be written to; made when absent, and gone again if nothing came of it."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{path}: there is a file in its place; use another folder") from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be made ({error.strerror}); use another folder"
+        ) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be written to; use another folder or change its rights")
+    try:
+        yield path
+    finally:
+        with suppress(OSError):  # some are not empty
+            for folder in made:
+                folder.rmdir()
+
+
+def _setup(given: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """The knobs of --setup, each once."""
+    setup: dict[str, float] = {}
+    for knob, value in given:
+        if knob in setup:
+            raise InputError(
+                f"--setup: {knob} is given twice, {setup[knob]:g} and {value:g}; give it once"
+            )
+        setup[knob] = value
+    return setup
+
+
+VERBS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "run": _run,
+    "import": _import,
+    "export": _export,
+    "record": _record,
+    "presysid": _presysid,
+    "train": _train,
+    "transfer": _transfer,
+    "submit": _submit,
+    "jobs": _jobs,
+    "serve": _serve,
+    "replay": _replay,
+    "diagnose": _diagnose,
+    "blind": _blind,
+    "virtual-robot": _virtual_robot,
+}
