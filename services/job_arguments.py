@@ -3,14 +3,15 @@
 import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn, get_args
 
 from pup.errors import InputError
 from pup.robot import built_in_robots
 from services.arguments import parser
 
-VERBS = ("import", "export", "record", "presysid", "train", "replay", "diagnose", "run")
+Verb = Literal["import", "export", "record", "presysid", "train", "replay", "diagnose", "run"]
 """Verbs that can be jobs: those that read and write files and end by themselves."""
+VERBS: tuple[Verb, ...] = get_args(Verb)
 RESUMABLE = ("presysid", "train", "diagnose", "run")
 """Those that go on from what they find in their folder; others begin anew."""
 REFUSED = {

@@ -1,6 +1,6 @@
 """The diagnosis of a bench servo: what is concealed is named, what is not is not."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,7 +146,7 @@ def test_fits_stay_in_their_boxes_and_find_the_corner() -> None:
     free = (Coordinate("a", 1.0, 0.0, 1.0), Coordinate("b", 1.0, 0.0, 2.0))
     noise = Noise(np.ones(3), np.zeros(3), "assumed")
     fit = Fit(free, np.array([0.9, 0.1]))
-    fit_together([fit], replays, noise)  # type: ignore[arg-type]
+    fit_together([fit], replays, noise)  # type: ignore[arg-type]  # it has all that a fit asks for
     assert fit.done
     assert fit.at[1] == pytest.approx(2.0)
     left = replays.measured.values - 2.0 * replays.matrix[:, 1]
@@ -182,19 +182,18 @@ def test_what_was_replayed_is_not_replayed_again(tmp_path: Path) -> None:
     measured = Measured.of(BENCH, recordings({}))
     asked = []
 
-    def runner(batches: list[Batch]) -> list[np.ndarray]:
+    def runner(batches: Sequence[Batch]) -> list[np.ndarray]:
         asked.append(len(batches))
         return threads(Bench(measured), 1)(batches)
 
     store = Store(tmp_path / "kept", "digest")
     rows = [{"kp/servo": 3.0 + 0.1 * i} for i in range(4)]
     first, second = (
-        Replays(measured, robot_space(BENCH, "pd"), store.around(runner), 1)(rows)  # type: ignore[arg-type]
-        for _ in range(2)
+        Replays(measured, robot_space(BENCH, "pd"), store.around(runner), 1)(rows) for _ in range(2)
     )
     assert np.array_equal(first, second)
     assert asked == [1, 0]
-    other = Store(tmp_path / "kept", "another").around(runner)  # type: ignore[arg-type]
+    other = Store(tmp_path / "kept", "another").around(runner)
     Replays(measured, robot_space(BENCH, "pd"), other, 1)(rows)
     assert asked[-1] == 1
     store.clear()

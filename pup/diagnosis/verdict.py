@@ -173,7 +173,8 @@ def held_out(measured: Measured, before: Model, after: Model, seed: int) -> Held
     improvement = 1 - np.sqrt(drawn[1] / np.maximum(drawn[0], 1e-300))
 
     def both(chosen: NDArray[np.bool_]) -> tuple[float, float]:
-        return tuple(float(np.sqrt(np.mean(s[chosen]))) for s in squares)  # type: ignore[return-value]
+        first, second = (float(np.sqrt(np.mean(s[chosen]))) for s in squares)
+        return first, second
 
     per_joint = {
         name: both(measured.channel == i)

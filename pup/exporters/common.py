@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ class Take:
 def nested(columns: Iterator[tuple[str, Array]]) -> Iterator[dict[str, Any]]:
     """Rows as JSON objects, `position/l_knee` as `{"position": {"l_knee": ...}}`; None for NaN."""
     named = [(name.partition("/"), values) for name, values in columns]
-    lists = [np.where(np.isnan(values), None, values).tolist() for _, values in named]  # type: ignore[call-overload]
+    lists = [[None if isnan(v) else v for v in values.tolist()] for _, values in named]
     for row in zip(*lists, strict=True):
         nest: dict[str, Any] = {}
         for ((kind, slash, part), _), value in zip(named, row, strict=True):

@@ -4,7 +4,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator
 from itertools import islice
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Path, Query, Request
 from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
@@ -19,7 +19,7 @@ from services.gateway.keys import Role, User
 from services.gateway.problems import responses
 from services.gateway.records import Row, job_document
 from services.gateway.shapes import Retry, Strict
-from services.job_arguments import COUNT, LENGTH, VERBS
+from services.job_arguments import COUNT, LENGTH, Verb
 
 CHUNK = 2**16
 FOLLOW = 0.5
@@ -38,7 +38,7 @@ router = APIRouter(prefix="/v1", route_class=IdempotentRoute)
 class NewJob(Strict):
     """A job to run: a verb of the command line and what stands behind it."""
 
-    verb: Literal[VERBS]  # type: ignore[valid-type]
+    verb: Verb
     arguments: Annotated[
         list[Annotated[str, Field(max_length=LENGTH)]],
         Field(max_length=COUNT, description="Paths are relative to the shared storage."),

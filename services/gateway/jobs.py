@@ -11,6 +11,7 @@ process wrote into shared storage goes before what Ray says: it outlives Ray's h
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 from services.job_folder import REVOKED, Outcome
 
@@ -165,8 +166,8 @@ class Job:
         reason = f"tried again by {who}"
         return replace(self, state=JobState.QUEUED, reason=reason, cancelled_by="", failures=0)
 
-    def _with(self, **changed: object) -> "Job":
-        last = replace(self.last, **changed)  # type: ignore[arg-type]
+    def _with(self, **changed: Any) -> "Job":
+        last = replace(self.last, **changed)
         return replace(self, attempts=(*self.attempts[:-1], last))
 
 
