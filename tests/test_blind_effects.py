@@ -107,3 +107,14 @@ def test_a_delayed_command_and_a_delayed_reading_cannot_be_told_apart() -> None:
     one, two = (readings(replace(world, effects=(e,)), moves)[0] for e in (command, reading))
     for name in one:
         assert np.abs(one[name].position - two[name].position).max() < 2e-4
+
+
+def test_a_joint_may_have_play_and_give_way_besides() -> None:
+    """Both are joints in series: as a pair, or as a nuisance of one another."""
+    world = world_of("servo_bench")
+    kit, rng = Kit.of(world.robot, False), np.random.default_rng(0)
+    play, give = (draw(name, kit, rng, ("joint",)) for name in ("backlash", "joint_compliance"))
+    alone = readings(replace(world, effects=(give,)), plans(world.robot, "bench"))[0]
+    both = readings(replace(world, effects=(play, give)), plans(world.robot, "bench"))[0]
+    apart = [both[name].stacked() - alone[name].stacked() for name in both]
+    assert np.sqrt(np.mean(np.concatenate(apart) ** 2)) > SEEN

@@ -120,14 +120,14 @@ def _equip(world: World, spec: mujoco.MjSpec, effect: Effect, support: str) -> N
     joints = [world.robot.joint_names[i] for i in world.joints_at(effect.place)]
     if effect.name == "backlash":
         for name in joints:
-            play = _second(spec, spec.joint(name), name, spec.joint(name).axis)
+            play = _second(spec, spec.joint(name), effect)
             play.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             play.range = (-effect.size, effect.size)
             play.solref_limit, play.solimp_limit = TEETH, HARD
             play.damping = (effect.shape["drag"], 0, 0)
     elif effect.name == "joint_compliance":
         for name in joints:
-            spring = _second(spec, spec.joint(name), name, spec.joint(name).axis)
+            spring = _second(spec, spec.joint(name), effect)
             _stiffen(spring, effect)
     elif effect.name == "structural_flex":
         for name in effect.place.names:
@@ -149,13 +149,12 @@ def _equip(world: World, spec: mujoco.MjSpec, effect: Effect, support: str) -> N
         _lay_ground(world, spec, effect)
 
 
-def _second(
-    spec: mujoco.MjSpec, joint: mujoco.MjsJoint, name: str, axis: Sequence[float]
-) -> mujoco.MjsJoint:
+def _second(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, effect: Effect) -> mujoco.MjsJoint:
+    """A joint of the same axis in series; one may have play and give way, too."""
     return joint.parent.add_joint(
-        name=f"{name}:gives",
+        name=f"{joint.name}:{effect.name}",
         type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=tuple(axis),
+        axis=tuple(joint.axis),
         pos=tuple(joint.pos),
         armature=0.0,
         frictionloss=0.0,
@@ -221,7 +220,7 @@ def _series(world: World, model: mujoco.MjModel) -> list[tuple[int, int, bool]]:
     for effect in world.effects:
         if effect.name in ("backlash", "joint_compliance"):
             for i in world.joints_at(effect.place):
-                second = model.joint(f"{world.robot.joint_names[i]}:gives")
+                second = model.joint(f"{world.robot.joint_names[i]}:{effect.name}")
                 found.append((i, int(second.qposadr[0]), effect.shape["side"] > 0))
     return found
 
