@@ -3,7 +3,6 @@
 import os
 import secrets
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -13,20 +12,10 @@ from pathlib import Path
 import httpx
 from gateways import free_port
 
+from workers import reaper
+
 MARK = "PUP_TEST_NODE"
 """Environment variable that every process of a node has, those of its jobs too."""
-
-
-def marked(name: str) -> list[int]:
-    """Processes of a node."""
-    mark, found = f"{MARK}={name}".encode(), []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if mark in (process / "environ").read_bytes().split(b"\0"):
-                found.append(int(process.name))
-        except OSError:
-            continue
-    return found
 
 
 def commands(words: str) -> list[int]:
@@ -79,24 +68,21 @@ class RayCluster:
             return 0
         return sum(node["raylet"].get("state") == "ALIVE" for node in nodes)
 
+    def processes(self, node: str) -> list[int]:
+        """Processes of a node, and of the jobs on it."""
+        return reaper.marked(self._mark(node))
+
     def kill(self, node: str) -> None:
         """Kill a node with all that runs on it, as a loss of power does."""
-        for _ in range(600):
-            left = marked(f"{self.name}-{node}")
-            for pid in left:
-                try:
-                    os.kill(pid, signal.SIGKILL)
-                except ProcessLookupError:
-                    continue
-            if not left:
-                return
-            time.sleep(0.05)
-        raise AssertionError(f"{node} cannot be killed")
+        assert reaper.end(self._mark(node), tries=300), f"{node} cannot be killed"
 
     def close(self) -> None:
         for node in self.nodes:
             self.kill(node)
         shutil.rmtree(self.temp, ignore_errors=True)
+
+    def _mark(self, node: str) -> str:
+        return f"{MARK}={self.name}-{node}"
 
     def _start(self, node: str, alive: int, *arguments: str) -> None:
         """Start a node; on a busy machine Ray gives up after a minute, so more than once."""

@@ -167,7 +167,7 @@ def test_a_worker_that_dies_with_the_job_costs_one_attempt(service, cluster, sha
     job = submitted(service, "presysid", "recordings", *LONG)
     wait_for_checkpoint(service, shared, job)
     (pid, *_) = ray_clusters.commands(f"services.job_runner {shared}/jobs/{job}")
-    number = next(n for n in (1, 2) if pid in ray_clusters.marked(f"{cluster.name}-worker{n}"))
+    number = next(n for n in (1, 2) if pid in cluster.processes(f"worker{n}"))
     cluster.kill(f"worker{number}")
     try:
         now = wait_for(service, job, "succeeded", "failed", "lost", seconds=900)

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 SESSION = "PUP_SESSION"
@@ -31,35 +32,43 @@ def start(folder: str) -> "subprocess.Popen[bytes]":
     )
 
 
-def _marked(folder: str) -> list[int]:
-    """Processes of the session."""
-    mark = f"{SESSION}={folder}".encode()
-    found = []
+def marked(mark: str) -> list[int]:
+    """Processes that have a mark, `NAME=value`, in their environment."""
+    wanted, found = mark.encode(), []
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            if mark in (process / "environ").read_bytes().split(b"\0"):
+            if wanted in (process / "environ").read_bytes().split(b"\0"):
                 found.append(int(process.name))
         except OSError:
             continue  # ended meanwhile, or of another user
     return found
 
 
-def _reap(folder: str, owner: int) -> None:
-    """End the session's processes but its owner, which may have only disconnected."""
-    for _ in range(50):
-        left = [pid for pid in _marked(folder) if pid != owner]
-        for pid in left:
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                continue
+def end(mark: str, spared: int | None = None, tries: int = 50) -> bool:
+    """Kill the processes that have a mark, and those that they start meanwhile.
+
+    Args:
+      mark: as in `marked`.
+      spared: a process that has it and goes on.
+      tries: a tenth of a second each.
+
+    Returns:
+      Whether none is left.
+    """
+    for _ in range(tries):
+        left = [pid for pid in marked(mark) if pid != spared]
         if not left:
-            break
+            return True
+        for pid in left:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
         time.sleep(0.1)
-    shutil.rmtree(folder, ignore_errors=True)
+    return False
 
 
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray sends it to all processes of a stopped job
     sys.stdin.buffer.read()
-    _reap(sys.argv[1], int(sys.argv[2]))
+    _, session, owner = sys.argv
+    end(f"{SESSION}={session}", spared=int(owner))  # it may have only disconnected
+    shutil.rmtree(session, ignore_errors=True)
