@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hardware_agent.config import Settings
-from hardware_agent.motion import MotionStatus
+from hardware_agent.status import MotionStatus
 from pup.wire import AgentState
 
 SILENT = 1.0  # s without a tick after which the loop counts as hung

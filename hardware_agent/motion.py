@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,10 +30,11 @@ from hardware_agent.activities import (
 )
 from hardware_agent.body import Body
 from hardware_agent.limits import Applied
-from hardware_agent.metronome import Metronome, Timing
+from hardware_agent.metronome import Metronome
 from hardware_agent.port import BusError
 from hardware_agent.rollout import Rollout
 from hardware_agent.senses import Response, Senses, Trip
+from hardware_agent.status import MotionStatus, Refused
 from hardware_agent.watchdog import Watchdog
 from pup.errors import InputError
 from pup.wire import AgentState, Assign, Outcome
@@ -44,44 +44,6 @@ PRIORITY = 20  # of the real-time scheduler
 STANDSTILL = 10.0  # s, the longest wait for an answer in lock-step
 BEAT = 0.05  # s between two beats meanwhile
 STATISTICS = 33  # ticks between updates of the loop's statistics
-
-
-@dataclass(frozen=True)
-class MotionStatus:
-    """What the loop tells of itself; published as a whole.
-
-    Attributes:
-      state: of the robot.
-      reason: why it is stopped or at fault; empty otherwise.
-      tick: when this was, s of CLOCK_MONOTONIC.
-      bus: whether the bus works.
-      senses: of the latest tick.
-      timing: of the loop.
-      repeated: questions to servos that had to be repeated, so far.
-      lost: answers that did not come in spite of it.
-      limited: what held the latest target back, by joint.
-    """
-
-    state: AgentState
-    reason: str
-    tick: float
-    bus: bool
-    senses: Senses | None
-    timing: Timing
-    repeated: int
-    lost: int
-    limited: dict[str, str]
-
-
-@dataclass(frozen=True)
-class Refused:
-    """A request that the robot's state does not allow.
-
-    Attributes:
-      reason: in words.
-    """
-
-    reason: str
 
 
 class Motion(threading.Thread):

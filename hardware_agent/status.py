@@ -1,0 +1,45 @@
+"""What the control loop tells other threads: its status, and what it does not do."""
+
+from dataclasses import dataclass
+
+from hardware_agent.metronome import Timing
+from hardware_agent.senses import Senses
+from pup.wire import AgentState
+
+
+@dataclass(frozen=True)
+class MotionStatus:
+    """What the loop tells of itself; published as a whole.
+
+    Attributes:
+      state: of the robot.
+      reason: why it is stopped or at fault; empty otherwise.
+      tick: when this was, s of CLOCK_MONOTONIC.
+      bus: whether the bus works.
+      senses: of the latest tick.
+      timing: of the loop.
+      repeated: questions to servos that had to be repeated, so far.
+      lost: answers that did not come in spite of it.
+      limited: what held the latest target back, by joint.
+    """
+
+    state: AgentState
+    reason: str
+    tick: float
+    bus: bool
+    senses: Senses | None
+    timing: Timing
+    repeated: int
+    lost: int
+    limited: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A request that the robot's state does not allow.
+
+    Attributes:
+      reason: in words.
+    """
+
+    reason: str
