@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 FEWEST = 4
 """Ticks of rest worth a mean: two in each half that are compared."""
 DRIFT = 0.004
-"""By how much the means of a rest's halves may differ, rad: under three steps of a 12-bit encoder. What
-drifts less is hardly misread by its mean."""
+"""By how much the means of a rest's halves may differ, rad: less than three steps of a 12-bit
+encoder. What drifts less is hardly misread by its mean."""
 
 
 def ticks_at_rest(recording: Recording) -> int:

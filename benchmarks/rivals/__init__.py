@@ -1,0 +1,1 @@
+"""Rivals of the diagnosis on concealed cases; see `benchmarks.blind_rivals`."""
