@@ -7,6 +7,7 @@ roll and pitch, now and a tick ago.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,6 +137,20 @@ def recording_of(
       notes: free text.
     """
     rows = rollout.rows
+    return Recording(
+        id=recording_id(assign),
+        robot=robot,
+        motion="walk",
+        support="ground",
+        source=source,
+        **columns_of(rows),
+        repeat_of=assign.repeat_of,
+        notes=notes,
+    )
+
+
+def columns_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """What rows say of joints, time, targets, positions and the rest, as a Recording takes it."""
     names = rows[0].senses.names
     extras: dict[str, Array] = {}
     for kind in DETAILS:
@@ -146,20 +161,13 @@ def recording_of(
         told = np.array([_inertial(row) for row in rows])
         extras |= {name: told[:, j] for j, name in enumerate(IMU_COLUMNS)}
     extras["torque_enabled"] = np.array([float(row.torque) for row in rows])
-    return Recording(
-        id=recording_id(assign),
-        robot=robot,
-        motion="walk",
-        support="ground",
-        source=source,
-        joints=names,
-        time=np.array([row.time for row in rows]),
-        target=np.array([row.applied.goal for row in rows]),
-        position=np.array([_fresh(row) for row in rows]),
-        extras={name: v for name, v in extras.items() if not np.isnan(v).all()},
-        repeat_of=assign.repeat_of,
-        notes=notes,
-    )
+    return {
+        "joints": names,
+        "time": np.array([row.time for row in rows]),
+        "target": np.array([row.applied.goal for row in rows]),
+        "position": np.array([_fresh(row) for row in rows]),
+        "extras": {name: v for name, v in extras.items() if not np.isnan(v).all()},
+    }
 
 
 def _fresh(row: Row) -> Array:

@@ -70,10 +70,10 @@ class Journal:
 
     def once(self, stage: Stage) -> None:
         """Do a step, unless it is done from the same inputs and its files are as it left them."""
-        inputs, entry = dict(stage.inputs), self._told["stages"].get(stage.name)
-        same = isinstance(entry, dict) and entry.get("inputs") == inputs
-        if same and entry.get("files") == self._files(stage):
+        if self.kept(stage):
             return
+        inputs = dict(stage.inputs)
+        same = self._entry(stage).get("inputs") == inputs
         if stage.folder:
             if self._told["begun"].get(stage.name, inputs) != inputs or (same and stage.remade):
                 shutil.rmtree(self.out / stage.folder, ignore_errors=True)
@@ -85,6 +85,16 @@ class Journal:
         done = {"inputs": inputs, "seconds": seconds, "files": self._files(stage)}
         self._told["stages"][stage.name] = done
         write_json(self.file, self._told)
+
+    def kept(self, stage: Stage) -> bool:
+        """Whether a step is done from the same inputs and its files are as it left them."""
+        entry = self._entry(stage)
+        same = entry.get("inputs") == dict(stage.inputs)
+        return same and entry.get("files") == self._files(stage)
+
+    def _entry(self, stage: Stage) -> dict[str, Any]:
+        entry = self._told["stages"].get(stage.name)
+        return entry if isinstance(entry, dict) else {}
 
     def done(self, name: str) -> Done:
         """What is told of a step that is done."""

@@ -84,7 +84,8 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     walks = evaluate(act, task(ParameterSampler(bounds), shown.episodes))
     draw_gait(out / "gait.png", robot, footage)
     if shown.landscape:
-        _write_landscape(out / "simulated.json", robot, policy, bounds, settings, shown, threads)
+        file, etas = out / "simulated.json", shown.landscape
+        write_landscape(file, robot, policy, bounds, settings, etas, shown.seed, threads)
     video, drawn = film(out / "walk", robot, footage)
     document = {
         "schema": 1,
@@ -111,20 +112,32 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     return document
 
 
-def _write_landscape(
+def write_landscape(
     file: Path,
     robot: RobotDescription,
     policy: NumpyPolicy,
     bounds: FittedBounds,
     settings: TaskSettings,
-    shown: Shown,
+    etas: int,
+    seed: int,
     threads: int,
 ) -> None:
-    """Distances over eta's box, where the projections of the bounds are; see docs/transfer.md."""
+    """Write distances over eta's box, where the projections of the bounds are.
+
+    Args:
+      file: where to, as docs/transfer.md has it.
+      robot: the robot.
+      policy: that is conditioned on eta.
+      bounds: of the robot's parameters.
+      settings: of the task.
+      etas: points of the box.
+      seed: of everything random.
+      threads: cores to use.
+    """
     card = policy.card
-    points = qmc.Sobol(card.shape.eta, seed=shown.seed).random(shown.landscape)
+    points = qmc.Sobol(card.shape.eta, seed=seed).random(etas)
     eta = qmc.scale(points, card.eta_lower, card.eta_upper)
-    distance = landscape(policy.act, robot, bounds, settings, eta, DRAWS, shown.seed, threads)
+    distance = landscape(policy.act, robot, bounds, settings, eta, DRAWS, seed, threads)
     write_json(file, {"schema": 1, "eta": eta.tolist(), "distance": distance.tolist()})
 
 
