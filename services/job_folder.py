@@ -142,23 +142,12 @@ class JobFolder:
             return None
 
     def files(self) -> Iterator[tuple[str, Path]]:
-        """Artefacts by name, sorted; links are none, nor are files that are being written."""
-        for folder, folders, files in os.walk(self.out):
-            folders.sort()
-            for name in sorted(files):
-                path = Path(folder) / name
-                if not name.startswith(".") and path.is_file() and not path.is_symlink():
-                    yield path.relative_to(self.out).as_posix(), path
+        """Artefacts by name, sorted."""
+        return below(self.out)
 
     def file(self, name: str) -> Path | None:
-        """An artefact by its name; None for whatever is none, such as a way out of the folder."""
-        parts = name.split("/")
-        if "\0" in name or "\\" in name or any(p in ("", ".", "..") for p in parts):
-            return None
-        path = self.out.joinpath(*parts)
-        inside = path.resolve().is_relative_to(self.out.resolve())
-        hidden = parts[-1].startswith(".")
-        return path if inside and not hidden and path.is_file() and not path.is_symlink() else None
+        """An artefact by its name; None for whatever is none."""
+        return inside(self.out, name)
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of the artefacts by name."""
@@ -190,6 +179,30 @@ class JobFolder:
 def folder_of(shared: Path, job: str) -> JobFolder:
     """The folder of a job."""
     return JobFolder(shared / JOBS / job)
+
+
+def below(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Files by name, sorted; links are none, nor are files that are being written."""
+    for place, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            path = Path(place) / name
+            if not name.startswith(".") and path.is_file() and not path.is_symlink():
+                yield path.relative_to(folder).as_posix(), path
+
+
+def inside(folder: Path, name: str) -> Path | None:
+    """A file of `below` by its name; None for whatever is none, such as a way out of the folder."""
+    parts = name.split("/")
+    if "\0" in name or "\\" in name or any(p in ("", ".", "..") for p in parts):
+        return None
+    path = folder.joinpath(*parts)
+    try:
+        within = path.resolve().is_relative_to(folder.resolve())
+        there = within and path.is_file() and not path.is_symlink()
+    except (OSError, RuntimeError):  # a name that is too long, a loop of links
+        return None
+    return path if there and not parts[-1].startswith(".") else None
 
 
 def _read(path: Path) -> dict[str, Any]:

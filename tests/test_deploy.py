@@ -213,7 +213,8 @@ def test_the_gateway_is_told_what_it_reads(name: str) -> None:
     assert ports == {"http": config.port, "link": LINK}
     mounts = [Path(m["mountPath"]) for m in container["volumeMounts"]]
     places = [config.data, *map(Path, (config.tokens, config.curve, config.agents))]
-    places += [Path(config.ray_token), Path(config.shared)]
+    places += [Path(config.ray_token), Path(config.shared), Path(config.recordings)]
+    assert Path(config.recordings).is_relative_to(config.shared)
     ray = one(overlay(name), "RayCluster")
     assert config.ray == f"http://{ray['metadata']['name']}-head-svc:8265"
     nodes = [ray["spec"]["headGroupSpec"], *ray["spec"]["workerGroupSpecs"]]

@@ -88,6 +88,7 @@ def test_an_operator_leads_a_study_to_its_end(open_page, service):
     walk = fake_agent.walks(lambda eta: 0.8 - 0.2 * sum((x - 0.3) ** 2 for x in eta))
     asked = gateways.STUDY | {"name": "stroll", "gate": "operator", "trials": 7, "repeats": 1}
     page = open_page()
+    page.goto("/studies")
     page.get_by_text("No study yet").wait_for()
     with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk, pause=0.3):
         http.post("/v1/studies", json=asked | {"initial": 6})
@@ -110,7 +111,11 @@ def test_an_operator_leads_a_study_to_its_end(open_page, service):
         page.get_by_text("41.5").wait_for()
         shot(page, "agents")
         phone = open_page(viewport=PHONE, has_touch=True, is_mobile=True)
-        for path, name in (("/", "studies"), ("/studies/stroll", "study"), ("/agents", "agents")):
+        for path, name in (
+            ("/studies", "studies"),
+            ("/studies/stroll", "study"),
+            ("/agents", "agents"),
+        ):
             phone.goto(path)
             wide = phone.evaluate("document.documentElement.scrollWidth")
             assert wide <= PHONE["width"], f"{path} is wider than a phone"

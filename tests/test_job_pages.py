@@ -91,7 +91,7 @@ def test_every_page_fits_and_is_accessible(open_page, size):
 
 def test_a_job_is_told_with_its_log_and_files(open_page):
     page = open_page()
-    page.get_by_role("link", name="Jobs").click()
+    page.get_by_role("navigation").get_by_role("link", name="Jobs").click()
     page.get_by_text("Jobs wait for the Ray cluster, which does not answer").wait_for()
     assert page.locator("tbody tr").count() == len(stored_jobs.ALL)
     page.get_by_role("link", name="job-done").click()

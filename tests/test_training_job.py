@@ -9,6 +9,8 @@ import pytest
 from commandline import pup
 from jobs import Job
 
+from services.gateway.artefacts import read as read_document
+from services.gateway.documents import TrainingDocument
 from services.transfer import read_simulated
 
 pytest.importorskip("torch")
@@ -33,6 +35,8 @@ def test_a_stopped_training_says_so_and_leaves_nothing_running(tmp_path: Path) -
     code, printed, told = job.end()
     assert code == 0, told
     job.assert_nothing_left()
+    shown = read_document(tmp_path / "short" / "training.json", TrainingDocument)
+    assert shown.done and shown.curve.steps[-1] == shown.steps >= 1000  # as pages show it
     policy = tmp_path / "short" / "policy"
     walk = ("replay", "--policy", policy, "--robot", "darwin_op2", "--episodes", 4, "--json")
     shown = pup(*walk, "--landscape", 2, "--out", tmp_path / "walk").json()

@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pup.transfer import orders
 from pup.transfer.study import Study, StudySettings
-from services.gateway import job_routes, names, pages, problems
+from services.gateway import job_routes, lab_pages, names, pages, problems
 from services.gateway.access import BODY_LIMIT, IdempotencyKey, IdempotentRoute, needs
 from services.gateway.answers import as_json, conductor_of, stream
 from services.gateway.conductor import Conductor
@@ -23,6 +23,7 @@ from services.gateway.keys import Role, Tokens, User
 from services.gateway.link import Link
 from services.gateway.metrics import Metrics
 from services.gateway.problems import problem, responses
+from services.gateway.recordings import Shelves
 from services.gateway.records import settings_of, study_document, trial_document
 from services.gateway.shapes import (
     AgentList,
@@ -52,7 +53,12 @@ v1 = APIRouter(prefix="/v1", route_class=IdempotentRoute)
 
 
 def application(
-    store: Store, tokens: Tokens, conductor: Conductor, dispatcher: Dispatcher, link: Link | None
+    store: Store,
+    tokens: Tokens,
+    conductor: Conductor,
+    dispatcher: Dispatcher,
+    link: Link | None,
+    shelves: Shelves | None = None,
 ) -> FastAPI:
     """The web application of a gateway.
 
@@ -62,6 +68,7 @@ def application(
       conductor: of the studies.
       dispatcher: of the jobs.
       link: to the agents; None where only the interface is wanted.
+      shelves: recordings that pages show.
     """
     app = FastAPI(
         title="pup",
@@ -73,10 +80,12 @@ def application(
     app.state.store, app.state.tokens, app.state.locks = store, tokens, {}
     app.state.conductor, app.state.dispatcher = conductor, dispatcher
     app.state.link, app.state.stopping = link, False
+    app.state.shelves = shelves or Shelves({})
     app.include_router(v1)
     app.include_router(job_routes.router)
     app.include_router(_service())
     app.include_router(pages.router)
+    app.include_router(lab_pages.router)
     app.mount("/static", StaticFiles(directory=pages.STATIC), name="static")
     problems.handle(app)
     app.add_middleware(_Guard, metrics=conductor.metrics)
@@ -119,7 +128,9 @@ class _Guard:
 
         async def sending(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message.get("headers", ()), *self.HEADERS]
+                told = list(message.get("headers", ()))
+                own = {name for name, _ in told}  # a report has a policy of its own
+                message["headers"] = told + [h for h in self.HEADERS if h[0] not in own]
                 spent = time.perf_counter() - began
                 self.metrics.requests.labels(method, message["status"]).observe(spent)
             await send(message)

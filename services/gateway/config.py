@@ -33,6 +33,7 @@ class Config:
       ray: URL of the dashboard of the Ray cluster that jobs run on; empty for no jobs.
       ray_token: file with the token of its authentication; empty for what Ray itself reads.
       shared: folder that the gateway and all nodes of that cluster have at the same path.
+      recordings: folder of recordings that pages show beside those that robots sent.
       log: least level that is logged, `debug`, `info`, `warning` or `error`.
     """
 
@@ -49,6 +50,7 @@ class Config:
     ray: str = ""
     ray_token: str = ""
     shared: str = ""
+    recordings: str = ""
     log: str = "info"
 
     @classmethod
@@ -92,6 +94,12 @@ class Config:
         """The CURVE keys."""
         folder = Path(self.curve) if self.curve else self.data / "curve"
         return KeyRing(folder, Path(self.agents) if self.agents else None)
+
+    @property
+    def shelves(self) -> dict[str, Path]:
+        """Folders of recordings that pages show."""
+        told = {"lab": Path(self.recordings).expanduser()} if self.recordings else {}
+        return told | {"robots": self.data / "recordings"}
 
     @property
     def loopback(self) -> bool:

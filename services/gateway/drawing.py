@@ -1,4 +1,4 @@
-"""Pictures of a study as SVG: distances by trial, and slices of the Gaussian process."""
+"""Pictures as SVG: axes, and those of a study: distances by trial, slices of its process."""
 
 import math
 from collections.abc import Sequence
@@ -8,10 +8,10 @@ from pup.transfer.study import Purpose, Study, Trial, TrialState
 from services.gateway.records import Row
 
 WIDTH, HEIGHT = 440, 220
-LEFT, RIGHT, TOP, BOTTOM = 48, 12, 14, 36
+LEFT, RIGHT, TOP, BOTTOM = 48, 12, 24, 36
 
 
-class _Axes:
+class Axes:
     """Where numbers are on a picture."""
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float], width: int) -> None:
@@ -35,7 +35,7 @@ class _Axes:
     def frame(self, x_name: str, y_name: str, x_ticks: Sequence[float]) -> list[str]:
         """Axes with numbers and names."""
         drawn = []
-        for y in _ticks(*self.y):
+        for y in ticks(*self.y):
             a, b = self.at(self.x[0], y), self.at(self.x[1], y)
             drawn.append(f'<line class="grid" x1="{a[0]}" y1="{a[1]}" x2="{b[0]}" y2="{b[1]}"/>')
             drawn.append(f'<text x="{LEFT - 6}" y="{a[1] + 4}" class="end">{y:.4g}</text>')
@@ -48,7 +48,8 @@ class _Axes:
         return drawn
 
 
-def _ticks(low: float, high: float) -> list[float]:
+def ticks(low: float, high: float) -> list[float]:
+    """Round numbers in a range, about four of them."""
     step = 10 ** math.floor(math.log10(max(high - low, 1e-9)))
     for share in (0.2, 0.5, 1.0):
         if (high - low) / (step * share) <= 6:
@@ -58,7 +59,8 @@ def _ticks(low: float, high: float) -> list[float]:
     return [i * step for i in range(first, math.floor(high / step) + 1)]
 
 
-def _svg(width: int, told: str, drawn: Sequence[str]) -> str:
+def svg(width: int, told: str, drawn: Sequence[str]) -> str:
+    """A picture of the usual height, with what it says to those who do not see it."""
     return (
         f'<svg viewBox="0 0 {width} {HEIGHT}" role="img" aria-label="{escape(told)}">'
         f"<title>{escape(told)}</title>{''.join(drawn)}</svg>"
@@ -72,7 +74,7 @@ def progress(study: Study) -> str:
     if not points:
         return ""
     last = max(2, len(study.trials))
-    axes = _Axes((0.5, last + 0.5), (0.0, max(d for _, d in points)), WIDTH)
+    axes = Axes((0.5, last + 0.5), (0.0, max(d for _, d in points)), WIDTH)
     step = max(1, last // 10)
     drawn = axes.frame("trial", "distance, m", range(1, last + 1, step))
     searched = [(t, d) for t, d in points if t.purpose in (Purpose.INITIAL, Purpose.SEARCH)]
@@ -82,10 +84,10 @@ def progress(study: Study) -> str:
         farthest += [max(d for _, d in searched[: i + 1])] * 2
     drawn.append(axes.line(numbers, farthest, "best"))
     drawn += [_mark(axes, t, d) for t, d in points]
-    return _svg(WIDTH, f"distances of {len(points)} walks", drawn)
+    return svg(WIDTH, f"distances of {len(points)} walks", drawn)
 
 
-def _mark(axes: _Axes, trial: Trial, distance: float) -> str:
+def _mark(axes: Axes, trial: Trial, distance: float) -> str:
     x, y = axes.at(trial.number, distance)
     told = f"trial {trial.number}, {trial.purpose}: {distance:.3f} m"
     kind = "infeasible" if trial.state is TrialState.INFEASIBLE else trial.purpose.value
@@ -106,7 +108,7 @@ def slices(posterior: Row, study: Study) -> list[str]:
     drawn = []
     for s in posterior["slices"]:
         entry, eta, mean, deviation = s["entry"], s["eta"], s["mean"], s["deviation"]
-        axes = _Axes((eta[0], eta[-1]), (min(everything), max(everything)), width)
+        axes = Axes((eta[0], eta[-1]), (min(everything), max(everything)), width)
         best = posterior["best"]["eta"][entry]
         marks = axes.frame(f"eta {entry + 1}", "m", [eta[0], (eta[0] + eta[-1]) / 2, eta[-1]])
         upper = [axes.at(x, m + 2 * d) for x, m, d in zip(eta, mean, deviation, strict=True)]
@@ -121,5 +123,5 @@ def slices(posterior: Row, study: Study) -> list[str]:
         for at, distance in seen:
             x, y = axes.at(at[entry], distance)
             marks.append(f'<circle class="seen" cx="{x}" cy="{y}" r="3"/>')
-        drawn.append(_svg(width, f"expected distance along eta {entry + 1}", marks))
+        drawn.append(svg(width, f"expected distance along eta {entry + 1}", marks))
     return drawn

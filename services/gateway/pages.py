@@ -1,20 +1,19 @@
-"""The pages: studies, jobs, one of them as it goes on, agents. Nothing comes from elsewhere."""
+"""The pages of what goes on: studies, jobs, one of them, agents. Nothing comes from elsewhere."""
 
 import asyncio
-import time
 from pathlib import Path
-from typing import Any
 from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Request
-from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from jinja2 import Environment, PackageLoader, select_autoescape
+from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
 from services.gateway import drawing, job_routes, names  # noqa: F401 - names makes {study:name} known
 from services.gateway.access import COOKIE, asking
+from services.gateway.artefacts import ways
 from services.gateway.conductor import Conductor
-from services.gateway.keys import Role, Tokens, User
+from services.gateway.html import login, page, part
+from services.gateway.keys import Tokens
 from services.gateway.records import study_document, trial_document
 
 STATIC = Path(__file__).parent / "static"
@@ -27,31 +26,12 @@ JOBS, ARTIFACTS, LOG = 100, 100, 6000
 """Jobs on their page; files and last bytes of the log on the page of one."""
 
 router = APIRouter(include_in_schema=False)
-_templates = Environment(
-    loader=PackageLoader("services.gateway"),
-    autoescape=select_autoescape(),
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
-_templates.filters["when"] = lambda at: time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(at))
-
-
-def _page(
-    name: str, request: Request, user: User | None, status: int = 200, **told: Any
-) -> Response:
-    may = user is not None and user.role >= Role.OPERATOR
-    text = _templates.get_template(name).render(user=user, may=may, path=request.url.path, **told)
-    return HTMLResponse(text, status)
-
-
-def _login(request: Request) -> Response:
-    return RedirectResponse("/login", 303)
 
 
 @router.get("/login")
-async def login(request: Request) -> Response:
+async def ask(request: Request) -> Response:
     """Asks for a token."""
-    return _page("login.html", request, None, wrong=False)
+    return page("login.html", request, None, wrong=False)
 
 
 @router.post("/login")
@@ -61,7 +41,7 @@ async def enter(request: Request) -> Response:
     token = form.get("token", [""])[0].strip()
     tokens: Tokens = request.app.state.tokens
     if tokens.user(token) is None:
-        return _page("login.html", request, None, 401, wrong=True)
+        return page("login.html", request, None, 401, wrong=True)
     response = RedirectResponse("/", 303)
     secure = request.url.scheme == "https"
     response.set_cookie(COOKIE, token, YEAR, httponly=True, samesite="strict", secure=secure)
@@ -76,17 +56,17 @@ async def leave() -> Response:
     return response
 
 
-@router.get("/")
+@router.get("/studies")
 async def studies(request: Request) -> Response:
     """All studies."""
     if (user := asking(request)) is None:
-        return _login(request)
+        return login()
     conductor: Conductor = request.app.state.conductor
     told = [
         study_document(study) | {"waits_for": conductor.waits_for(study)}
         for study in reversed(conductor.studies.values())
     ]
-    return _page("studies.html", request, user, studies=told)
+    return page("studies.html", request, user, studies=told)
 
 
 @router.get("/studies/{study:name}")
@@ -94,7 +74,7 @@ async def studies(request: Request) -> Response:
 async def one(request: Request, study: str) -> Response:
     """A study; `live` is the part that changes."""
     if (user := asking(request)) is None:
-        return _login(request)
+        return login()
     conductor: Conductor = request.app.state.conductor
     found = conductor.study(study)
     posterior = await conductor.posterior(study)
@@ -103,8 +83,8 @@ async def one(request: Request, study: str) -> Response:
     if view and trial and view.sample and view.sample.trial == trial.id:
         sample = view.sample
     best = posterior["best"]
-    name = "study_live.html" if request.url.path.endswith("/live") else "study.html"
-    return _page(
+    name = part(request, "study.html", "study_live.html")
+    return page(
         name,
         request,
         user,
@@ -123,13 +103,13 @@ async def one(request: Request, study: str) -> Response:
 async def jobs(request: Request) -> Response:
     """Jobs, newest first; `live` is the part that changes."""
     if (user := asking(request)) is None:
-        return _login(request)
+        return login()
     dispatcher = job_routes.dispatcher_of(request)
     found = dispatcher.newest()
     told = [await job_routes.document(dispatcher, job) for job in found[:JOBS]]
     more = len(found) - len(told)
-    name = "jobs_live.html" if request.url.path.endswith("/live") else "jobs.html"
-    return _page(name, request, user, jobs=told, more=more, trouble=dispatcher.trouble)
+    name = part(request, "jobs.html", "jobs_live.html")
+    return page(name, request, user, jobs=told, more=more, trouble=dispatcher.trouble)
 
 
 @router.get("/jobs/{job:name}")
@@ -137,18 +117,19 @@ async def jobs(request: Request) -> Response:
 async def one_job(request: Request, job: str) -> Response:
     """A job; `live` is the part that changes."""
     if (user := asking(request)) is None:
-        return _login(request)
+        return login()
     dispatcher = job_routes.dispatcher_of(request)
     found = dispatcher.job(job)
     files = await job_routes.artifacts(dispatcher, found)
-    name = "job_live.html" if request.url.path.endswith("/live") else "job.html"
-    return _page(
+    name = part(request, "job.html", "job_live.html")
+    return page(
         name,
         request,
         user,
         job=await job_routes.document(dispatcher, found),
         open=found.open,
         mine=job_routes.may(user, found),
+        ways=ways(found, [file["name"] for file in files]),
         artifacts=files[:ARTIFACTS],
         more=len(files[ARTIFACTS:]),
         log=await asyncio.to_thread(dispatcher.folder(job).tail, LOG),
@@ -160,10 +141,10 @@ async def one_job(request: Request, job: str) -> Response:
 async def agents(request: Request) -> Response:
     """The agents and how they are; `live` is the part that changes."""
     if (user := asking(request)) is None:
-        return _login(request)
+        return login()
     conductor: Conductor = request.app.state.conductor
     told = [conductor.agents[name].document() for name in sorted(conductor.agents)]
     for agent in told:
         agent["health"] = list(agent["health"].items())[:SHOWN]
-    name = "agents_live.html" if request.url.path.endswith("/live") else "agents.html"
-    return _page(name, request, user, agents=told)
+    name = part(request, "agents.html", "agents_live.html")
+    return page(name, request, user, agents=told)

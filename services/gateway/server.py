@@ -22,6 +22,7 @@ from services.gateway.keys import KeyRing, Tokens
 from services.gateway.link import Link
 from services.gateway.metrics import Metrics
 from services.gateway.ray_jobs import RayJobs, token_of
+from services.gateway.recordings import Shelves
 from services.gateway.store import ReplacedError, Store
 
 log = logging.getLogger(__name__)
@@ -80,7 +81,7 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
         await conductor.load()
         await dispatcher.load()
         link.start()
-        app = application(store, tokens, conductor, dispatcher, link)
+        app = application(store, tokens, conductor, dispatcher, link, Shelves(config.shelves))
         server = _Server(
             uvicorn.Config(
                 app,

@@ -1,0 +1,103 @@
+"""Recordings that pages show: folders of Parquet files, looked through within limits."""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+
+from pup.errors import InputError
+from pup.recording import Recording
+from pup.recording_file import Header, read_header
+from services.gateway.conductor import UnknownError
+from services.job_folder import below, inside
+
+LISTED = 500
+"""Recordings of a folder that are listed."""
+LOOKED = 20_000
+"""Files of a folder that are looked at."""
+CELLS = 4_000_000
+"""Numbers of a recording that is drawn: an hour at 50 Hz of 20 joints."""
+SUFFIX = ".parquet"
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A recording in a list.
+
+    Attributes:
+      name: of its file, below its shelf.
+      header: what the file tells; None where it cannot be read.
+      trouble: why not, in one line.
+    """
+
+    name: str
+    header: Header | None = None
+    trouble: str = ""
+
+
+class Shelves:
+    """Folders of recordings.
+
+    Args:
+      folders: by the names that they have on pages.
+    """
+
+    def __init__(self, folders: Mapping[str, Path]) -> None:
+        self.folders = folders
+        self._drawing = asyncio.Semaphore(1)
+
+    def listed(self, shelf: str) -> tuple[list[Listed], bool]:
+        """Recordings of a shelf by name, and whether there are more."""
+        files = islice(below(self._folder(shelf)), LOOKED)
+        found = [(name, path) for name, path in files if name.endswith(SUFFIX)]
+        return [_listed(name, path) for name, path in found[:LISTED]], len(found) > LISTED
+
+    async def read(self, shelf: str, name: str) -> Recording:
+        """A recording, for its drawing: one at a time, for they may be large.
+
+        Raises:
+          UnknownError: there is none of this name.
+          InputError: it cannot be read, or is too large; the message is one line.
+        """
+        path = inside(self._folder(shelf), name) if name.endswith(SUFFIX) else None
+        if path is None:
+            raise UnknownError(f"there is no recording {name[:200]}")
+        async with self._drawing:
+            return await asyncio.to_thread(_read, path)
+
+    def _folder(self, shelf: str) -> Path:
+        if shelf not in self.folders:
+            raise UnknownError(f"there is no folder of recordings {shelf}")
+        return self.folders[shelf]
+
+
+def _listed(name: str, path: Path) -> Listed:
+    try:
+        status = path.stat()
+        return Listed(name, _header(path, status.st_mtime_ns, status.st_size))
+    except InputError as error:
+        return Listed(name, trouble=_told(error, path))
+    except OSError as error:
+        return Listed(name, trouble=error.strerror or "it cannot be read")
+
+
+@lru_cache(maxsize=4096)
+def _header(path: Path, modified: int, size: int) -> Header:
+    return read_header(path)
+
+
+def _read(path: Path) -> Recording:
+    try:
+        cells = read_header(path).cells
+        if cells > CELLS:
+            raise InputError(f"{cells} numbers; recordings of up to {CELLS} are drawn")
+        return Recording.read(path)
+    except InputError as error:
+        raise InputError(_told(error, path)) from error
+
+
+def _told(error: InputError, path: Path) -> str:
+    """A mistake without the folder, which is none of the reader's business."""
+    return str(error).removeprefix(f"{path}: ")[:500]
