@@ -52,15 +52,18 @@ class Refit:
 
 def exhaustive(case: Case) -> Verdict:
     """Refit every effect of the library at every place and in every shape, one at a time."""
-    refits = refitted(case, case.nominal.fit, hypotheses(case.measured))
-    best = _best(refits)
-    bic = np.array([case.nominal.fit.chi2, *(r.bic for r in best)])
-    weights = _weights(bic)
-    if not best or best[0].bic > bic[0] - STRONG:
+    return chosen(case, refitted(case, case.nominal.fit, hypotheses(case.measured)))
+
+
+def chosen(case: Case, refits: Sequence[Refit]) -> Verdict:
+    """The best of some refits of the nominal model by BIC, and what might stand in its place."""
+    best, nominal = _best(refits), case.nominal.fit.chi2
+    if not best or best[0].bic > nominal - STRONG:
         return Verdict(mismatch=False)
+    weights = _weights(np.array([nominal, *(refit.bic for refit in best)]))[1:]
     named = [
         Named(*refit.hypothesis.key, float(weight))
-        for refit, weight in zip(best, weights[1:], strict=True)
+        for refit, weight in zip(best, weights, strict=True)
         if weight >= WORTH_SAYING
     ]
     return Verdict(True, tuple(named[:1]), tuple(named[1:]), best[0].fit)

@@ -22,8 +22,11 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Column = Callable[[Seen, int], Array]
 
-SLOW, STRIBECK = 0.05, 0.5
-"""Speeds at which signs of a speed fade, and at which grip at rest has, rad/s."""
+BEND, STRIBECK = 0.01, 0.5
+"""Way in which friction turns, rad: at rest it holds as it last did. Speed at which grip at rest
+has faded, rad/s."""
+SMALL = 0.003
+"""Error at which its sign fades, rad."""
 LATE, SKEW = 0.01, 0.003
 """Delay, s, and skew of clocks that columns are made for."""
 RATES = (1.5, 3.0, 6.0)
@@ -36,8 +39,14 @@ CERTAIN = 2.0
 """Standard errors by which a law must predict recordings left out better than none."""
 
 
-def _sign(values: Array, width: float) -> Array:
-    return np.tanh(values / width)
+def _grip(s: Seen, j: int) -> Array:
+    """Direction that dry friction holds against, -1 to 1."""
+    moved = np.diff(s.position[:, j])
+    kept = np.exp(-np.abs(moved) / BEND)
+    grip = np.zeros(len(s.time))
+    for row, (share, way) in enumerate(zip(kept, np.sign(moved), strict=True), start=1):
+        grip[row] = share * grip[row - 1] + (1 - share) * way
+    return grip
 
 
 def _behind(s: Seen, j: int, time: Array) -> Array:
@@ -66,15 +75,9 @@ def _beyond(s: Seen, j: int, side: float) -> Array:
 
 
 DICTIONARY: tuple[tuple[str, Column], ...] = (
-    ("coulomb_friction", lambda s, j: _sign(s.velocity[:, j], SLOW)),
-    (
-        "stribeck_friction",
-        lambda s, j: _sign(s.velocity[:, j], SLOW) * np.exp(-np.abs(s.velocity[:, j]) / STRIBECK),
-    ),
-    (
-        "load_dependent_friction",
-        lambda s, j: np.abs(s.torque[:, j]) * _sign(s.velocity[:, j], SLOW),
-    ),
+    ("coulomb_friction", _grip),
+    ("stribeck_friction", lambda s, j: _grip(s, j) * np.exp(-np.abs(s.velocity[:, j]) / STRIBECK)),
+    ("load_dependent_friction", lambda s, j: _grip(s, j) * np.abs(s.torque[:, j])),
     ("quadratic_damping", lambda s, j: s.velocity[:, j] * np.abs(s.velocity[:, j])),
     (
         "torque_speed_limit",
@@ -87,7 +90,7 @@ DICTIONARY: tuple[tuple[str, Column], ...] = (
     ("command_delay", lambda s, j: _behind(s, j, s.time - LATE)),
     ("clock_skew", lambda s, j: _behind(s, j, s.time * (1 + SKEW))),
     *(("target_rate_limit", lambda s, j, r=r: _limited(s, j, r)) for r in RATES),
-    ("dead_band", lambda s, j: s.free[:, j] * _sign(s.error[:, j], 0.003)),
+    ("dead_band", lambda s, j: s.free[:, j] * np.tanh(s.error[:, j] / SMALL)),
     ("gain_asymmetry", lambda s, j: s.free[:, j] * np.abs(s.error[:, j])),
     ("integral_action", _summed),
     ("encoder_bias", lambda s, j: s.free[:, j]),
