@@ -225,12 +225,12 @@ def run_fit(
                 fit.save(checkpoint)
             if progress is not None:
                 progress(fit.result)
+        # The first mean itself is never a candidate; a short search may not have found its like.
+        fit.consider(settings.start, float(evaluate(settings.start[None])[0]))
         if polish is not None:
             if fit.polished is None:
                 fit.polished = polish(fit.result.best)
                 if checkpoint is not None and not fit.longer:
                     fit.save(checkpoint)
             fit.consider(fit.polished, float(evaluate(fit.polished[None])[0]))
-        # The first mean itself is never a candidate; a short search may not have found its like.
-        fit.consider(settings.start, float(evaluate(settings.start[None])[0]))
         return fit.result
