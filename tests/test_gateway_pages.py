@@ -1,24 +1,16 @@
 """The pages in a real headless Chromium: a study as it goes on, the gate, agents, on a phone."""
 
-import os
-import shutil
 import signal
-from pathlib import Path
 
 import fake_agent
 import gateways
+import pages
 import pytest
 
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
-playwright = pytest.importorskip("playwright.sync_api")
 
-CHROMIUM = (
-    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-)
-PHONE = {"width": 390, "height": 844}
-SHOTS = os.environ.get("PUP_SHOTS")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+pytestmark = pages.NEEDED
 
 
 @pytest.fixture(scope="module")
@@ -29,48 +21,14 @@ def service(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    with playwright.sync_playwright() as p:
-        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with pages.chromium() as made:
         yield made
-        made.close()
 
 
 @pytest.fixture
-def open_page(browser, service):
-    """Opens a page as somebody; collects errors and requests to elsewhere."""
-    contexts, wrong = [], []
-
-    def opened(role="operator", **options):
-        context = browser.new_context(base_url=service.url, **options)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(60_000)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda m: wrong.append(m.text) if "Security Policy" in m.text else None)
-        page.on(
-            "request",
-            lambda r: (
-                None if r.url.startswith(service.url) else wrong.append(f"elsewhere: {r.url}")
-            ),
-        )
-        page.on("dialog", lambda dialog: dialog.accept())
-        if role:
-            page.goto("/login")
-            page.get_by_label("Token").fill(service.tokens[role])
-            page.get_by_role("button", name="Enter").click()
-            page.wait_for_url("**/")
-        return page
-
-    yield opened
-    for context in contexts:
-        context.close()
-    assert wrong == []
-
-
-def shot(page, name):
-    if SHOTS:
-        Path(SHOTS).mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=f"{SHOTS}/{name}.png", full_page=True)
+def open_page(browser, service):  # whose answers may be errors: some tests provoke them
+    with pages.opener(browser, service, lambda m: "Security Policy" in m.text) as opened:
+        yield opened
 
 
 def test_without_a_token_there_is_the_way_in(open_page):
@@ -80,7 +38,7 @@ def test_without_a_token_there_is_the_way_in(open_page):
     page.get_by_label("Token").fill("wrong")
     page.get_by_role("button", name="Enter").click()
     page.get_by_text("not known").wait_for()
-    shot(page, "login")
+    pages.shot(page, "login")
 
 
 def test_an_operator_leads_a_study_to_its_end(open_page, service):
@@ -97,20 +55,20 @@ def test_an_operator_leads_a_study_to_its_end(open_page, service):
         for number in range(1, 9):
             page.get_by_role("button", name=f"Release trial {number}", exact=True).click()
             if number == 8:
-                shot(page, "study")
+                pages.shot(page, "study")
         page.get_by_text("done", exact=True).first.wait_for()
         assert page.locator("svg").count() == 4
         assert page.locator("polygon.band").count() == 3
         assert page.locator("tbody tr").count() == 8
         assert page.get_by_role("button", name="Release").count() == 0
-        shot(page, "study_done")
+        pages.shot(page, "study_done")
         page.get_by_role("link", name="Studies").click()
         page.get_by_text("7 of 7").wait_for()
-        shot(page, "studies")
+        pages.shot(page, "studies")
         page.get_by_role("link", name="Agents").click()
         page.get_by_text("41.5").wait_for()
-        shot(page, "agents")
-        phone = open_page(viewport=PHONE, has_touch=True, is_mobile=True)
+        pages.shot(page, "agents")
+        phone = open_page(viewport=pages.PHONE, has_touch=True, is_mobile=True)
         for path, name in (
             ("/studies", "studies"),
             ("/studies/stroll", "study"),
@@ -118,8 +76,8 @@ def test_an_operator_leads_a_study_to_its_end(open_page, service):
         ):
             phone.goto(path)
             wide = phone.evaluate("document.documentElement.scrollWidth")
-            assert wide <= PHONE["width"], f"{path} is wider than a phone"
-            shot(phone, f"phone_{name}")
+            assert wide <= pages.PHONE["width"], f"{path} is wider than a phone"
+            pages.shot(phone, f"phone_{name}")
 
 
 def test_a_viewer_has_no_buttons_and_a_stop_stops(open_page, service):
@@ -134,7 +92,7 @@ def test_a_viewer_has_no_buttons_and_a_stop_stops(open_page, service):
             one.get_by_text("0.10 m").wait_for()
         assert viewer.get_by_role("button", name="STOP").count() == 0
         assert viewer.get_by_role("button", name="Cancel").count() == 0
-        shot(page, "study_running")
+        pages.shot(page, "study_running")
         page.get_by_role("button", name="STOP page-2").click()
         page.get_by_text("was stopped by operator").wait_for()
         assert agent.state == "stopped"
@@ -162,7 +120,7 @@ def test_names_are_text_and_nothing_else(open_page, service):
         page.get_by_text("<script>document").first.wait_for()
         assert page.title() == "pup: text" and page.locator("img").count() == 0
         page.get_by_role("button", name="Retry").wait_for()
-        shot(page, "study_paused")
+        pages.shot(page, "study_paused")
 
 
 def test_a_gateway_that_is_away_is_told_and_comes_back(open_page, service):
@@ -175,7 +133,7 @@ def test_a_gateway_that_is_away_is_told_and_comes_back(open_page, service):
     page.get_by_text("does not answer").first.wait_for()
     page.get_by_role("button", name="Pause").click()
     page.get_by_text("nothing was done").wait_for()
-    shot(page, "away")
+    pages.shot(page, "away")
     service.start()
     page.locator("#away").wait_for(state="hidden")
     page.get_by_role("button", name="Pause").click()

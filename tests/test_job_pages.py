@@ -1,24 +1,21 @@
 """The pages of jobs in a real headless Chromium: states, log, artefacts, buttons, on a phone."""
 
 import os
-import shutil
 from pathlib import Path
 
 import gateways
+import pages
 import pytest
 import stored_jobs
 
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
-playwright = pytest.importorskip("playwright.sync_api")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 AXE = os.environ.get("PUP_AXE")
 """File axe.min.js of axe-core, where accessibility is to be checked by it."""
-SHOTS = os.environ.get("PUP_SHOTS")
-SIZES = {"wide": {"width": 1280, "height": 900}, "phone": {"width": 390, "height": 844}}
+SIZES = {"wide": {"width": 1280, "height": 900}, "phone": pages.PHONE}
 PATHS = ("/jobs", *(f"/jobs/{job.id}" for job in stored_jobs.ALL))
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+pytestmark = pages.NEEDED
 
 
 @pytest.fixture(scope="module")
@@ -33,55 +30,25 @@ def service(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser(service):  # whose store is written without a loop around it
-    with playwright.sync_playwright() as p:
-        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with pages.chromium() as made:
         yield made
-        made.close()
 
 
 @pytest.fixture
 def open_page(browser, service):
-    contexts, wrong = [], []
-
-    def opened(role="operator", size="wide"):
-        context = browser.new_context(base_url=service.url, viewport=SIZES[size])
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(60_000)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
-        page.on(
-            "request",
-            lambda r: None if r.url.startswith(service.url) else wrong.append(r.url),
-        )
-        page.on("dialog", lambda dialog: dialog.accept())
-        page.goto("/login")
-        page.get_by_label("Token").fill(service.tokens[role])
-        page.get_by_role("button", name="Enter").click()
-        page.wait_for_url("**/")
-        return page
-
-    yield opened
-    for context in contexts:
-        context.close()
-    assert wrong == []
-
-
-def shot(page, name):
-    if SHOTS:
-        Path(SHOTS).mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=f"{SHOTS}/{name}.png", full_page=True)
+    with pages.opener(browser, service, lambda message: message.type == "error") as opened:
+        yield opened
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_every_page_fits_and_is_accessible(open_page, size):
-    page = open_page(size=size)
+    page = open_page(viewport=SIZES[size])
     for path in PATHS:
         page.goto(path)
         page.locator("h1").wait_for()
         wide = page.evaluate("document.documentElement.scrollWidth")
         assert wide <= SIZES[size]["width"], f"{path} is wider than the screen"
-        shot(page, f"{size}{path.replace('/', '_')}")
+        pages.shot(page, f"{size}{path.replace('/', '_')}")
         if AXE:
             page.evaluate(Path(AXE).read_text())
             found = page.evaluate("axe.run()")["violations"]
