@@ -151,7 +151,7 @@ def _fit(lab: Lab, runs: Path) -> None:
     hostile = "<script>document.title='taken'</script><form action='/logout' method='post'></form>"
     (lab.out("mission") / "report.html").write_text(
         f"<!doctype html><title>mission</title><h1>Job</h1>{link}{hostile}"
-        "<p><a href='run.json' id='file'>journal</a></p><img src='https://elsewhere.test/x.png'>"
+        "<p><a href='run.json' id='file'>journal</a></p>"
     )
     (lab.out("mission") / "run.json").write_text("{}")
 

@@ -89,7 +89,7 @@ def test_any_curve_can_be_drawn(values: list[float | None]) -> None:
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({}, "The simulator lacks backlash."),
+        ({}, "The simulator lacks backlash at joint knee."),
         ({"findings": [FINDING | {"probability": 0.3}]}, "Most likely the simulator lacks"),
         (
             {"findings": [FINDING, FINDING | {"effect": "encoder_bias"}]},
@@ -97,7 +97,7 @@ def test_any_curve_can_be_drawn(values: list[float | None]) -> None:
         ),
         (
             {"findings": [FINDING, FINDING | {"effect": "unknown", "probability": 0.2}]},
-            "The simulator lacks backlash, and more that has no name.",
+            "The simulator lacks backlash at joint knee, and more that has no name.",
         ),
         ({"findings": [FINDING | {"effect": "unknown"}]}, "no known effect explains"),
         ({"verdict": "none", "findings": []}, "Nothing material is missing beyond a noise of 2 m"),
@@ -197,7 +197,7 @@ def test_a_recording_that_is_too_large_is_not_drawn(
 
     stored_findings.currents().write(tmp_path / "currents.parquet")
     shelves = Shelves({"lab": tmp_path})
-    assert asyncio.run(shelves.read("lab", "currents.parquet")).id == "currents"
+    assert asyncio.run(shelves.read(shelves.file("lab", "currents.parquet"))).id == "currents"
     monkeypatch.setattr(recordings, "CELLS", 100)
     with pytest.raises(InputError, match="recordings of up to 100 are drawn"):
-        asyncio.run(shelves.read("lab", "currents.parquet"))
+        asyncio.run(shelves.read(shelves.file("lab", "currents.parquet")))

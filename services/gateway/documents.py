@@ -9,6 +9,7 @@ from pup.diagnosis.laws import NAMELESS
 SURE = 0.7
 """What is less probable is told as the likeliest of several."""
 Text = Annotated[str, Field(max_length=500)]
+Prose = Annotated[str, Field(max_length=20_000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0, le=10**15)]
 Numbers = Annotated[list[float | None], Field(max_length=500_000)]
@@ -153,7 +154,6 @@ class FoundEffect(Claim):
     """A finding, with what explains the data as well."""
 
     equivalents: Annotated[list[Claim], Field(max_length=200)] = []
-    law: str | None = None
 
 
 class Floor(BaseModel):
@@ -174,14 +174,14 @@ class Ask(BaseModel):
     """The recording that would tell more."""
 
     motion: Text
-    reason: Text
+    reason: Prose
 
 
 class DiagnosisDocument(Document):
     """`diagnosis.json`."""
 
     verdict: Literal["mismatch", "none", "undetermined"]
-    reason: Text = ""
+    reason: Prose = ""
     noise_floor: Floor
     findings: Annotated[list[FoundEffect], Field(max_length=1000)]
     held_out: LeftOut | None = None
@@ -195,14 +195,16 @@ class DiagnosisDocument(Document):
         if self.verdict == "none":
             floor = 1000 * self.noise_floor.rms
             return f"Nothing material is missing beyond a noise of {floor:.2g} mrad."
-        known = list(dict.fromkeys(f.name for f in self.findings if f.effect != NAMELESS))
-        if not known:
+        named = [f for f in self.findings if f.effect != NAMELESS]
+        known = list(dict.fromkeys(f.name for f in named))
+        if not named:
             return "Something is missing that no known effect explains."
-        if len(known) > 3:
+        if len(named) == 1:
+            told = f"{named[0].name} at {named[0].place}"
+        elif len(known) > 3:
             told = f"{len(known)} effects"
         else:
             told = " and ".join(filter(None, (", ".join(known[:-1]), known[-1])))
-        beyond = any(f.effect == NAMELESS for f in self.findings)
-        sure = all(f.probability >= SURE for f in self.findings if f.effect != NAMELESS)
-        lacks = f"{'The' if sure else 'Most likely the'} simulator lacks {told}"
-        return f"{lacks}{', and more that has no name' if beyond else ''}."
+        beyond = ", and more that has no name" if len(named) < len(self.findings) else ""
+        sure = all(f.probability >= SURE for f in named)
+        return f"{'The' if sure else 'Most likely the'} simulator lacks {told}{beyond}."

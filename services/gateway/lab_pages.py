@@ -89,8 +89,10 @@ async def one_recording(request: Request, shelf: str, name: str) -> Response:
     """A recording: command, position and current of each joint."""
     if (user := asking(request)) is None:
         return login()
+    shelves = _shelves(request)
+    file = shelves.file(shelf, name)
     try:
-        found = await _shelves(request).read(shelf, name)
+        found = await shelves.read(file)
     except InputError as error:
         told = {"name": name, "trouble": str(error)}
         return page("recording.html", request, user, recording=None, **told)

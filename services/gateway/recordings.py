@@ -54,16 +54,23 @@ class Shelves:
         found = [(name, path) for name, path in files if name.endswith(SUFFIX)]
         return [_listed(name, path) for name, path in found[:LISTED]], len(found) > LISTED
 
-    async def read(self, shelf: str, name: str) -> Recording:
-        """A recording, for its drawing: one at a time, for they may be large.
+    def file(self, shelf: str, name: str) -> Path:
+        """A recording's file.
 
         Raises:
           UnknownError: there is none of this name.
-          InputError: it cannot be read, or is too large; the message is one line.
         """
         path = inside(self._folder(shelf), name) if name.endswith(SUFFIX) else None
         if path is None:
             raise UnknownError(f"there is no recording {name[:200]}")
+        return path
+
+    async def read(self, path: Path) -> Recording:
+        """A recording, for its drawing: one at a time, for they may be large.
+
+        Raises:
+          InputError: it cannot be read, or is too large; the message is one line.
+        """
         async with self._drawing:
             return await asyncio.to_thread(_read, path)
 

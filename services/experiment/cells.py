@@ -1,0 +1,214 @@
+"""The cells of an experiment: runs that stand alone, each told by what it depends on."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+from pup.files import sha256
+from pup.policy.bundle import CARD
+from pup.policy.shape import Method
+from pup.robot import RobotDescription
+from services.experiment.plan import Plan, Walk, training
+
+FLEET = "presysid-fleet"
+SEARCHED = (Method.PUP, Method.UP)
+"""Methods whose policies are conditioned on something that trials can choose."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A run.
+
+    Attributes:
+      name: unique; that of its folder.
+      kind: what is done, a name in `work.KINDS`.
+      needs: cells whose results it takes, by the part that each plays.
+      told: all else that its result depends on.
+      given: where things lie that `told` has the digests of.
+      weight: how long it takes, roughly, s; the longest are begun first.
+    """
+
+    name: str
+    kind: str
+    needs: Mapping[str, str] = field(default_factory=dict)
+    told: Mapping[str, Any] = field(default_factory=dict)
+    given: Mapping[str, str] = field(default_factory=dict)
+    weight: float = 1.0
+
+
+def graph(plan: Plan, ready: Path | None = None, real: Path | None = None) -> dict[str, Cell]:
+    """The cells of a plan and those that these need, each after those.
+
+    Args:
+      plan: the experiment.
+      ready: folder of policies that are trained already, `<direction>/<method>/` each.
+      real: folder of recordings of a real robot, to be identified and diagnosed beside.
+
+    Raises:
+      InputError: the robot cannot take part.
+    """
+    return _Graph(plan, ready, real).cells()
+
+
+def chosen(cells: Mapping[str, Cell], names: Iterable[str]) -> dict[str, Cell]:
+    """Some cells and those that they need, in the same order."""
+    wanted = set(names)
+    for name in reversed(list(cells)):
+        if name in wanted:
+            wanted |= set(cells[name].needs.values())
+    return {name: cell for name, cell in cells.items() if name in wanted}
+
+
+class _Graph:
+    def __init__(self, plan: Plan, ready: Path | None, real: Path | None) -> None:
+        self.plan, self.ready, self.real = plan, ready, real
+        self.robot = RobotDescription.load(plan.robot)
+        if self.robot.gait is None or any(j.servo_id is None for j in self.robot.joints):
+            raise InputError(f"robot {self.robot.name!r}: an experiment needs a gait and servo ids")
+        self._cells: dict[str, Cell] = {}
+
+    def cells(self) -> dict[str, Cell]:
+        for seed in self.plan.seeds:
+            self._record(seed)
+        self._presysid(FLEET, self.plan.fleet, self._recordings(self.plan.seeds))
+        for seed in self.plan.seeds:
+            self._presysid(f"presysid-r{seed}", self.plan.presysid, self._recordings([seed]))
+        for walk in self.plan.walks:
+            for method in walk.methods:
+                self._policy(walk, method)
+                self._trials(walk, method)
+        for seed in self.plan.seeds:
+            self._diagnosis(seed)
+        for walk in self.plan.walks:
+            if Method.PUP in walk.methods:
+                self._corrected(walk)
+        if self.real is not None:
+            self._real(self.real)
+        done = (*self.plan.stages, "real")
+        wanted = [name for name, cell in self._cells.items() if self._stage(cell) in done]
+        return chosen(self._cells, wanted)
+
+    def _stage(self, cell: Cell) -> str:
+        """Which stage a cell belongs to."""
+        if cell.name.endswith("-real"):
+            return "real"
+        if "corrected" in cell.name or cell.name.endswith("-own"):
+            return "corrected"
+        if cell.name.endswith("-prior") or cell.kind == "landscape":
+            return "prior"
+        return cell.kind
+
+    def _add(self, cell: Cell) -> None:
+        self._cells[cell.name] = cell
+
+    def _told(self, **more: Any) -> dict[str, Any]:
+        return {"robot": self.robot.digest, "seed": self.plan.seed, **more}
+
+    def _given(self, **more: Any) -> dict[str, str]:
+        return {"robot": str(self.robot.folder.absolute()), **more}
+
+    def _recordings(self, seeds: Iterable[int]) -> dict[str, str]:
+        return {f"recordings {seed}": f"record-r{seed}" for seed in seeds}
+
+    def _seeds(self, walk: Walk) -> tuple[int, ...]:
+        return self.plan.seeds[: walk.robots]
+
+    def _record(self, seed: int) -> None:
+        record = self.plan.record
+        told = self._told(character=seed, motions=record.motions, repeats=record.repeats)
+        weight = 10.0 * len(record.motions) * record.repeats
+        self._add(Cell(f"record-r{seed}", "record", {}, told, self._given(), weight))
+
+    def _presysid(self, name: str, fits: Any, needs: Mapping[str, str]) -> None:
+        told = self._told(fits=asdict(fits))
+        weight = 0.2 * fits.generations * fits.population * len(needs)
+        self._add(Cell(name, "presysid", dict(needs), told, self._given(), weight))
+
+    def _policy(self, walk: Walk, method: Method) -> None:
+        name, train = f"policy-{walk.direction}-{method}", self.plan.train
+        if self.ready is not None and (folder := self._shelf(walk, method)) is not None:
+            told = self._told(ready=sha256(folder / CARD), method=method, direction=walk.direction)
+            given = self._given(policy=str(folder.absolute()))
+            self._add(Cell(name, "policy", {}, told, given))
+            return
+        told = self._told(method=method, direction=walk.direction, training=train.fleet)
+        needs, weight = {"bounds": FLEET}, training(train.fleet).steps / 5000
+        self._add(Cell(name, "policy", needs, told, self._given(), weight))
+
+    def _shelf(self, walk: Walk, method: Method) -> Path | None:
+        """A policy that is trained already."""
+        assert self.ready is not None
+        folder = self.ready / walk.direction / method
+        found = [f for f in (folder, folder / "policy") if (f / CARD).is_file()]
+        return found[0] if found else None
+
+    def _trials(self, walk: Walk, method: Method) -> None:
+        policy, trials = f"policy-{walk.direction}-{method}", self.plan.trials
+        landscape = f"landscape-{walk.direction}-{method}"
+        if method in SEARCHED:
+            told = self._told(etas=trials.landscape, horizon=trials.horizon)
+            needs = {"policy": policy, "bounds": FLEET}
+            self._add(Cell(landscape, "landscape", needs, told, self._given(), 60.0))
+        for seed in self._seeds(walk):
+            name = f"trials-r{seed}-{walk.direction}-{method}"
+            if method not in SEARCHED:
+                self._walked(name, seed, 1, {"policy": policy})
+                continue
+            needs = {"policy": policy, "bounds": f"presysid-r{seed}"}
+            self._walked(name, seed, trials.trials, needs)
+            self._walked(f"{name}-prior", seed, trials.prior, needs | {"landscape": landscape})
+
+    def _walked(self, name: str, seed: int, count: int, needs: Mapping[str, str]) -> None:
+        trials = self.plan.trials
+        told = self._told(
+            character=seed, trials=count, repeats=trials.repeats, horizon=trials.horizon
+        )
+        weight = (count + 2 * trials.repeats) * trials.horizon / 5
+        self._add(Cell(name, "trials", dict(needs), told, self._given(), weight))
+
+    def _diagnosis(self, seed: int) -> None:
+        plan, needs = self.plan.diagnosis, self._recordings([seed])
+        walked = [w for w in self.plan.walks if seed in self._seeds(w) and Method.PUP in w.methods]
+        if plan.rollouts and walked:
+            needs["rollouts"] = f"trials-r{seed}-{walked[0].direction}-{Method.PUP}"
+        told = self._told(**asdict(plan))
+        self._add(Cell(f"diagnosis-r{seed}", "diagnosis", needs, told, self._given(), 1e3))
+
+    def _corrected(self, walk: Walk) -> None:
+        """The fleet's policy trained on for each robot, in its corrected simulator and its own."""
+        policy = f"policy-{walk.direction}-{Method.PUP}"
+        for seed in self._seeds(walk):
+            refit = f"presysid-r{seed}-corrected"
+            if refit not in self._cells:
+                # NN-PD beside the effects: the same parameters as the policy that is trained on.
+                fits = asdict(self.plan.presysid) | {"compare": False}
+                needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
+                self._add(Cell(refit, "presysid", needs, self._told(fits=fits), self._given(), 1e3))
+            own = {"bounds": f"presysid-r{seed}"}
+            corrected = {"bounds": refit, "robot": f"diagnosis-r{seed}"}
+            ways = {"corrected": corrected} | ({"own": own} if self.plan.control else {})
+            for way, needs in ways.items():
+                self._further(walk, seed, way, needs | {"start": policy})
+
+    def _further(self, walk: Walk, seed: int, way: str, needs: Mapping[str, str]) -> None:
+        train, last = self.plan.train, f"r{seed}-{walk.direction}-{way}"
+        told = self._told(method=Method.PUP, direction=walk.direction, training=train.further)
+        weight = training(train.further).steps / 5000
+        policy = f"policy-{last}"
+        self._add(Cell(policy, "policy", dict(needs), told, self._given(), weight))
+        walked = {name: cell for name, cell in needs.items() if name != "start"}
+        walked["policy"] = policy
+        self._walked(f"trials-{last}", seed, self.plan.trials.trials, walked)
+
+    def _real(self, folder: Path) -> None:
+        files = sorted(folder.glob("*.parquet"))
+        if not files:
+            raise InputError(f"{folder}: no *.parquet in this folder; see `pup import`")
+        told = {"recordings": {file.name: sha256(file) for file in files}}
+        given = self._given(recordings=str(folder.absolute()))
+        fits = asdict(self.plan.fleet) | {"compare": True}
+        self._add(Cell("presysid-real", "presysid", {}, self._told(fits=fits, **told), given, 1e5))
+        plan = asdict(self.plan.diagnosis) | {"rivals": True, "rollouts": 0, "motions": ()}
+        self._add(Cell("diagnosis-real", "diagnosis", {}, self._told(**plan, **told), given, 1e5))

@@ -1,0 +1,67 @@
+"""What diagnoses of concealed robots named, and by how much they lower the error held out."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pup.physics.terms import CLASS_OF
+from services.experiment.plan import Plan
+from services.experiment.statistics import Estimate, estimate, median, share_true
+
+CONCEALED = {
+    "actuator": (
+        *("dry_friction", "load_friction", "speed_loss", "lost_motion"),
+        *("delay", "supply", "drift"),
+    ),
+    "contact": ("ground_compliance", "ground_slope"),
+    "body": ("bias", "inertia"),
+    "sensor": ("imu",),
+}
+"""Classes of effects (CONTRACTS.md, section 6) that every virtual robot has, by its parts."""
+
+
+def diagnoses(plan: Plan, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Verdicts by robot, and what they come to.
+
+    Args:
+      plan: of the experiment.
+      found: results of its cells by name.
+
+    Returns:
+      `robots` with verdict, classes named and errors held out; `named`, the share of robots on
+      which an effect of each part was named; `classes`, that of each class; `improvement`, the
+      median share by which the corrected simulator lowers the error held out.
+    """
+    cells = {f"r{seed}": found.get(f"diagnosis-r{seed}") for seed in plan.seeds}
+    robots = {robot: _of_robot(one) for robot, one in cells.items() if one is not None}
+    rows = list(robots.values())
+    known = [row["improvement"] for row in rows if row["improvement"] is not None]
+    classes = sorted({name for row in rows for name in row["classes"]})
+    return {
+        "concealed": {part: list(names) for part, names in CONCEALED.items()},
+        "robots": robots,
+        "named": {part: _share([row["named"][part] for row in rows]) for part in CONCEALED},
+        "actuator_and_contact": _share(
+            [row["named"]["actuator"] and row["named"]["contact"] for row in rows]
+        ),
+        "classes": {name: _share([name in row["classes"] for row in rows]) for name in classes},
+        "improvement": estimate(median, [[value] for value in known], plan.seed).document(),
+    }
+
+
+def _of_robot(told: Mapping[str, Any]) -> dict[str, Any]:
+    classes = sorted({CLASS_OF.get(f["effect"], "unknown") for f in told["findings"]})
+    held = told["held_out"]
+    before, after = (held["rmse_before"], held["rmse_after"]) if held else (None, None)
+    return {
+        "verdict": told["verdict"],
+        "classes": classes,
+        "named": {part: any(c in names for c in classes) for part, names in CONCEALED.items()},
+        "rmse_before": before,
+        "rmse_after": after,
+        "improvement": 1 - after / before if before else None,
+    }
+
+
+def _share(told: list[bool]) -> dict[str, Any]:
+    found: Estimate = estimate(share_true, [[float(value)] for value in told])
+    return found.document()

@@ -1,0 +1,230 @@
+"""Figures of an experiment: those of the paper, for many robots, and ours.
+
+All are drawn from the document of `experiment.json`; dots are robots, bars their means.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from pup.sysid.figures import (
+    AMBER,
+    BLUE,
+    GREEN,
+    INK,
+    PALE,
+    PURPLE,
+    RED,
+    ROW,
+    SOFT,
+    VERMILLION,
+    WIDTH,
+    as_svg,
+    new_figure,
+)
+from pup.sysid.html import Drawing
+from services.experiment.statistics import best_so_far
+
+COLOURS = {"pup": VERMILLION, "up": AMBER, "robust": BLUE, "nominal": SOFT}
+NAMES = {
+    "pup": "PUP + BO",
+    "up": "UP + BO",
+    "robust": "Robust",
+    "nominal": "Nominal",
+    "pup+prior": "PUP + BO, prior",
+    "up+prior": "UP + BO, prior",
+    "pup+fitted": "PUP, no trials",
+    "up+fitted": "UP, no trials",
+    "pup+own": "PUP trained on + BO, own simulator",
+    "pup+corrected": "PUP trained on + BO, corrected",
+    "pup+own+fitted": "PUP trained on, own simulator, no trials",
+    "pup+corrected+fitted": "PUP trained on, corrected, no trials",
+}
+"""What arms are called where people read."""
+METHODS = tuple(COLOURS)
+QUANTITIES = {"distance": "distance, m", "time": "time before the fall, s"}
+
+
+def walked(directions: Mapping[str, Any], quantity: str) -> Drawing:
+    """Distance or time of each direction and method, with the deviation of all walks (the paper's).
+
+    Args:
+      directions: of the document.
+      quantity: `distance` or `time`.
+    """
+    figure = new_figure(WIDTH + 0.9, 3.0)
+    axes = figure.subplots()
+    wide = 0.8 / len(METHODS)
+    for i, part in enumerate(directions.values()):
+        for k, method in enumerate(METHODS):
+            told = part["statistics"]["arms"].get(method)
+            if told is None:
+                continue
+            at, bar = i - 0.4 + (k + 0.5) * wide, told[quantity]
+            axes.bar(at, bar["value"], wide * 0.9, color=COLOURS[method], alpha=0.75)
+            axes.errorbar(at, bar["value"], yerr=bar["std"] or 0, color=INK, capsize=2.5, lw=1)
+            means = [float(np.mean(w[quantity])) for w in part["walks"][method].values()]
+            axes.plot(_spread(at, wide, len(means)), means, ".", color=INK, ms=3.5, alpha=0.6)
+    for method in METHODS:
+        if any(method in part["walks"] for part in directions.values()):
+            axes.bar(0, 0, 0, color=COLOURS[method], alpha=0.75, label=NAMES[method])
+    axes.set_xticks(range(len(directions)), list(directions))
+    axes.set_xlim(-0.55, len(directions) - 0.45)
+    axes.tick_params(axis="x", length=0)
+    axes.set_ylabel(QUANTITIES[quantity])
+    axes.axhline(0, color=SOFT, lw=0.8)
+    axes.grid(axis="y")
+    figure.legend(loc="outside upper left", ncols=4, fontsize=8)
+    return as_svg(figure)
+
+
+def _spread(at: float, wide: float, count: int) -> np.ndarray:
+    return at + (np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)) * wide
+
+
+def per_robot(walks: Mapping[str, Any]) -> Drawing:
+    """Each method's mean distance on each robot, a row for each.
+
+    Args:
+      walks: of one direction, by arm and robot.
+    """
+    arms = [method for method in METHODS if method in walks]
+    robots = sorted({robot for arm in arms for robot in walks[arm]})
+    figure = new_figure(WIDTH + 0.4, 1.1 + 0.24 * len(robots))
+    axes = figure.subplots()
+    for arm in arms:
+        rows = [(robots.index(r), walk["distance"]) for r, walk in walks[arm].items()]
+        middle = [float(np.mean(distance)) for _, distance in rows]
+        spread = [
+            float(np.std(distance, ddof=1)) if len(distance) > 1 else 0 for _, distance in rows
+        ]
+        at = np.array([row for row, _ in rows]) + 0.14 * (arms.index(arm) - (len(arms) - 1) / 2)
+        axes.errorbar(
+            middle, at, xerr=spread, fmt="o", ms=4, lw=0.9, color=COLOURS[arm], label=NAMES[arm]
+        )
+    _rows(axes, robots)
+    axes.set_xlabel("distance, m (bars: deviation of the walks)")
+    axes.grid(axis="x")
+    figure.legend(loc="outside upper left", ncols=4, fontsize=8)
+    return as_svg(figure)
+
+
+def searches(part: Mapping[str, Any]) -> Drawing:
+    """The best walk so far over trials, as a share of what PUP comes after all of them.
+
+    Args:
+      part: one direction of the document.
+    """
+    figure = new_figure(WIDTH, 2.9)
+    axes = figure.subplots()
+    goals = {r: float(np.mean(w["distance"])) for r, w in part["walks"]["pup"].items()}
+    for arm, told in part["searches"].items():
+        shares = [
+            np.array(best_so_far(distances)) / goals[robot]
+            for robot, distances in told.items()
+            if distances and goals.get(robot, 0) > 0
+        ]
+        if not shares or arm not in NAMES:
+            continue
+        shortest = min(map(len, shares))
+        drawn = np.array([share[:shortest] for share in shares])
+        trial, method = np.arange(1, shortest + 1), arm.partition("+")[0]
+        dash = "--" if "prior" in arm else ":" if arm != method else "-"
+        colour = GREEN if "corrected" in arm else PURPLE if "own" in arm else COLOURS[method]
+        low, high = np.quantile(drawn, [0.25, 0.75], axis=0)
+        axes.fill_between(trial, low, high, color=colour, alpha=0.1, lw=0)
+        axes.plot(trial, np.median(drawn, axis=0), dash, color=colour, label=NAMES[arm], ms=3)
+    axes.axhline(0.95, color=PALE, lw=1)
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("trials")
+    axes.set_ylabel("best walk so far, share of PUP's\ndistance after all trials")
+    axes.grid()
+    figure.legend(loc="outside upper left", ncols=2, fontsize=7.5)
+    return as_svg(figure)
+
+
+def fleet_bounds(bounds: Mapping[str, Any]) -> Drawing:
+    """The fleet's bounds in the search range, with each robot's own fit as a dot.
+
+    Args:
+      bounds: of the document.
+    """
+    parameters = bounds["parameters"]
+    figure = new_figure(WIDTH, 1.1 + ROW * len(parameters))
+    axes = figure.subplots()
+    for row, p in enumerate(parameters):
+        first, width = p["search"][0], p["search"][1] - p["search"][0]
+        low, high, nominal = ((p[k] - first) / width for k in ("lower", "upper", "nominal"))
+        colour = BLUE if p["identified"] else PALE
+        axes.barh(row, high - low, 0.6, left=low, color=colour, alpha=0.55)
+        axes.vlines(nominal, row - 0.42, row + 0.42, color=RED, lw=2.2)
+        own = [(told[p["name"]] - first) / width for told in bounds["robots"].values()]
+        axes.plot(own, np.full(len(own), row), ".", color=INK, ms=4.5)
+    axes.barh(0, 0, 0, color=BLUE, alpha=0.55, label="bounds of the fleet")
+    axes.plot([], [], color=RED, lw=2.2, label="its nominal values")
+    axes.plot([], [], ".", color=INK, ms=4.5, label="fits of single robots")
+    _rows(axes, [p["name"] for p in parameters])
+    axes.set_xlim(-0.01, 1.01)
+    axes.set_xlabel("search range (0: lower end, 1: upper end)")
+    axes.grid(axis="x")
+    figure.legend(loc="outside upper left", ncols=3, fontsize=8)
+    return as_svg(figure)
+
+
+def before_after(robots: Mapping[str, tuple[float, float]], label: str) -> Drawing:
+    """A number of each robot before and after, an arrow each.
+
+    Args:
+      robots: before and after, by robot.
+      label: what it is, with its unit.
+    """
+    names = sorted(robots)
+    figure = new_figure(WIDTH, 1.1 + 0.24 * len(names))
+    axes = figure.subplots()
+    for row, name in enumerate(names):
+        before, after = robots[name]
+        axes.annotate(
+            "", (after, row), (before, row), arrowprops={"arrowstyle": "->", "color": SOFT, "lw": 1}
+        )
+        axes.plot(before, row, "o", ms=5, color=SOFT, label="before" if row == 0 else None)
+        axes.plot(after, row, "o", ms=5, color=GREEN, label="after" if row == 0 else None)
+    _rows(axes, names)
+    axes.set_xlim(left=min(0.0, *(min(pair) for pair in robots.values())))
+    axes.set_xlabel(label)
+    axes.grid(axis="x")
+    figure.legend(loc="outside upper left", ncols=2, fontsize=8)
+    return as_svg(figure)
+
+
+def held_out(models: Mapping[str, Any]) -> Drawing:
+    """Errors of several models on motions left out, overall and by type of motion.
+
+    Args:
+      models: `rmse` and `per_motion` (rad) by the model's name.
+    """
+    names = list(models)
+    motions = sorted({m for told in models.values() for m in told["per_motion"]})
+    figure = new_figure(WIDTH, 1.2 + 0.3 * (1 + len(motions)) * max(1, len(names)) / 2)
+    axes = figure.subplots()
+    colours = dict(zip(names, (SOFT, BLUE, AMBER, GREEN, PURPLE), strict=False))
+    height = 0.8 / len(names)
+    for k, name in enumerate(names):
+        told = models[name]
+        values = [told["rmse"], *(told["per_motion"].get(m, np.nan) for m in motions)]
+        at = np.arange(len(values)) - 0.4 + (k + 0.5) * height
+        axes.barh(at, 1e3 * np.array(values, float), height * 0.9, color=colours[name], label=name)
+    _rows(axes, ["all", *motions])
+    axes.set_xlabel("error on motions left out, mrad")
+    axes.grid(axis="x")
+    figure.legend(loc="outside upper left", ncols=2, fontsize=8)
+    return as_svg(figure)
+
+
+def _rows(axes: Any, names: Sequence[str]) -> None:
+    """One row each, from the top."""
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)

@@ -1,0 +1,154 @@
+"""`experiment.json`: what all cells found, and what the robots say together."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pup.policy.shape import Method
+from services.experiment.cells import FLEET, Cell
+from services.experiment.diagnosed import diagnoses
+from services.experiment.plan import Plan, Walk
+from services.experiment.run import Order, digest
+from services.experiment.verdicts import acceptance, of_direction
+from services.provenance import engine, now
+
+SCHEMA = 1
+FURTHER = ("own", "corrected")
+PRIOR = "-prior"
+FITTED = "+fitted"
+
+
+def gather(
+    plan: Plan, cells: Mapping[str, Cell], failed: Mapping[str, str], out: Path
+) -> dict[str, Any]:
+    """The document of an experiment, as far as it is done.
+
+    Args:
+      plan: what was to be done.
+      cells: of it.
+      failed: those that failed or need some that did, and why.
+      out: folder of the experiment.
+
+    Returns:
+      See docs/experiment.md.
+    """
+    done = {name: Order(cell, out) for name, cell in cells.items() if name not in failed}
+    found = {name: order.result() for name, order in done.items()}
+    directions = {str(walk.direction): _direction(plan, walk, found) for walk in plan.walks}
+    for part in directions.values():
+        part["statistics"] = of_direction(part, plan.seed)
+    diagnosed = diagnoses(plan, found)
+    return {
+        "schema": SCHEMA,
+        "robot": plan.robot,
+        "plan": plan.document(),
+        "acceptance": acceptance(directions, diagnosed),
+        "directions": directions,
+        "bounds": _bounds(plan, found),
+        "diagnosis": diagnosed,
+        "recordings": _recordings(plan, found),
+        "real": _real(found),
+        "failed": dict(sorted(failed.items())),
+        "cells": {name: _cell(order) for name, order in done.items()},
+        "written_by": engine(),
+        "written": now(),
+    }
+
+
+def _cell(order: Order) -> dict[str, Any]:
+    made = order.made()
+    return {
+        "kind": order.cell.kind,
+        "seconds": order.seconds(),
+        "digest": digest(order.result()),
+        "host": made["host"],
+        "ended": made["ended"],
+        "source_sha256": made["by"]["source_sha256"],
+    }
+
+
+def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Walks and searches of a direction, by arm and robot.
+
+    An arm is a method, whose eta was chosen by trials, with what is different: `+prior` where the
+    search began with simulated rollouts, `+own` and `+corrected` where the policy was trained on in
+    a simulator of this robot, `+fitted` where eta is that of the fitted parameters, without trials.
+    """
+    walks: dict[str, Any] = {}
+    searches: dict[str, Any] = {}
+    for seed in plan.seeds[: walk.robots]:
+        start = f"trials-r{seed}-{walk.direction}-"
+        named = {str(m): f"{start}{m}" for m in walk.methods}
+        named |= {f"{m}+prior": f"{start}{m}{PRIOR}" for m in walk.methods}
+        named |= {f"{Method.PUP}+{way}": f"{start}{way}" for way in FURTHER}
+        for arm, name in named.items():
+            if name not in found:
+                continue
+            result, robot = found[name], f"r{seed}"
+            if result["chosen"]["distance"]:
+                walks.setdefault(arm, {})[robot] = result["chosen"]
+            fitted = result["fitted"]
+            if fitted and fitted["distance"] and not name.endswith(PRIOR):
+                walks.setdefault(f"{arm}{FITTED}", {})[robot] = fitted
+            searched = [
+                one["distance"]
+                for one in result["walks"]
+                if one["purpose"] in ("initial", "search") and one["state"] == "succeeded"
+            ]
+            if fitted is not None:
+                searches.setdefault(arm, {})[robot] = searched
+    return {"walks": walks, "searches": searches}
+
+
+def _bounds(plan: Plan, found: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Bounds of the fleet, what each robot's own fit says, and how the fleet's went."""
+    if FLEET not in found:
+        return None
+    fleet = found[FLEET]
+    robots = {}
+    for seed in plan.seeds:
+        if (own := found.get(f"presysid-r{seed}")) is not None:
+            robots[f"r{seed}"] = {p["name"]: p["nominal"] for p in own["parameters"]}
+    return {
+        "parameters": fleet["parameters"],
+        "loss": fleet["loss"],
+        "histories": fleet["histories"],
+        "robots": robots,
+        "inside": _inside(fleet["parameters"], robots),
+    }
+
+
+def _inside(
+    parameters: list[dict[str, Any]], robots: Mapping[str, Mapping[str, float]]
+) -> dict[str, float]:
+    """Share of the robots whose own fit lies within the fleet's bounds, by parameter."""
+    if not robots:
+        return {}
+    share = {}
+    for p in parameters:
+        told = [own[p["name"]] for own in robots.values() if p["name"] in own]
+        if told:
+            within = [p["lower"] <= value <= p["upper"] for value in told]
+            share[p["name"]] = sum(within) / len(within)
+    return share
+
+
+def _recordings(plan: Plan, found: Mapping[str, Any]) -> dict[str, Any]:
+    told = {f"r{seed}": found.get(f"record-r{seed}") for seed in plan.seeds}
+    return {
+        robot: {"count": len(one["recordings"]), "stopped": one["stopped"]}
+        for robot, one in told.items()
+        if one is not None
+    }
+
+
+def _real(found: Mapping[str, Any]) -> dict[str, Any] | None:
+    """A real robot's recordings: losses of both torque laws, and errors on motions left out."""
+    fits, verdict = found.get("presysid-real"), found.get("diagnosis-real")
+    if fits is None and verdict is None:
+        return None
+    return {
+        "histories": fits["histories"] if fits else None,
+        "loss": fits["loss"] if fits else None,
+        "diagnosis": verdict,
+    }

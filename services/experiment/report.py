@@ -1,0 +1,269 @@
+"""The report of an experiment: one page that needs nothing but itself."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pup.files import write_atomic
+from pup.sysid.figures import LABELS, convergence, drawing_style
+from pup.sysid.html import Column, Html, figure, page, table, tag
+from services.experiment import figures
+
+MISSING = "-"
+
+
+def write_report(document: Mapping[str, Any], file: Path) -> None:
+    """Write the report, whole or not at all.
+
+    Args:
+      document: of `experiment.json`.
+      file: where to.
+    """
+    with drawing_style():
+        write_atomic(file, page("Concealed robots", *_content(document)))
+
+
+def estimated(told: Mapping[str, Any] | None, digits: int = 2) -> str:
+    """A number with its interval, in words."""
+    if not told or told["value"] is None:
+        return MISSING
+    value = f"{told['value']:.{digits}f}"
+    interval = told.get("ci90")
+    if not interval:
+        return value
+    low, high = ("∞" if end is None else f"{end:.{digits}f}" for end in interval)
+    return f"{value} ({low} to {high})"
+
+
+def _content(told: Mapping[str, Any]) -> Iterator[Html]:
+    plan = told["plan"]
+    yield tag("h1", "Concealed robots")
+    yield tag(
+        "p",
+        f"{len(plan['seeds'])} virtual robots of {told['robot']} with physics that training never "
+        "saw, through the real chain: recordings from the servo bus, bounds, policies, trials over "
+        "ZeroMQ. Intervals are 90 %, of robots drawn with replacement.",
+        class_="lead",
+    )
+    yield tag("h2", "What was to be shown")
+    yield from _acceptance(told)
+    for direction, part in told["directions"].items():
+        if not part["walks"]:
+            continue
+        yield tag("h2", f"Walking {direction}")
+        yield from _direction(part)
+    yield from _walked(told["directions"])
+    if told["bounds"]:
+        yield tag("h2", "Bounds of the fleet")
+        yield from _bounds(told["bounds"])
+    if told["diagnosis"]["robots"]:
+        yield tag("h2", "Diagnosis")
+        yield from _diagnosis(told)
+    if told["real"]:
+        yield tag("h2", "A real robot's recordings")
+        yield from _real(told["real"])
+    yield tag("h2", "How it came about")
+    yield from _provenance(told)
+
+
+def _acceptance(told: Mapping[str, Any]) -> Iterator[Html]:
+    columns = [Column("Line", "long"), Column("Found", "number"), Column("Robots", "number")]
+    columns += [Column("Bar", "number"), Column("", "status")]
+    rows = [
+        (
+            line["line"],
+            estimated(line) if line["value"] is not None else "∞",
+            str(line["robots"]),
+            f"{line['bar']:g}",
+            "holds" if line["holds"] else "does not hold",
+        )
+        for line in told["acceptance"]
+    ]
+    yield table("Bars, and what was found", columns, rows)
+
+
+def _walked(directions: Mapping[str, Any]) -> Iterator[Html]:
+    shown = {name: part for name, part in directions.items() if part["walks"]}
+    if not shown:
+        return
+    yield tag("h2", "Distance and time")
+    for quantity, words in (("distance", "Distance"), ("time", "Time before the fall")):
+        yield figure(
+            figures.walked(shown, quantity),
+            f"{words} of each direction and method; the tables above have the numbers.",
+            f"{words}, after the choice of eta. Bars: mean over robots; error bars: one standard "
+            "deviation of all walks; dots: means of single robots.",
+        )
+
+
+def _direction(part: Mapping[str, Any]) -> Iterator[Html]:
+    told = part["statistics"]
+    columns = [Column("Policy", "words"), Column("Distance [m]", "number")]
+    columns += [Column(t, "number") for t in ("sd", "sd of a robot", "Time [s]", "sd", "Robots")]
+    rows = [
+        (
+            name,
+            estimated(arm["distance"]),
+            _sd(arm["distance"]["std"]),
+            _sd(arm["distance"]["std_of_a_robot"]),
+            estimated(arm["time"], 1),
+            _sd(arm["time"]["std"]),
+            str(arm["distance"]["robots"]),
+        )
+        for key, name in figures.NAMES.items()
+        if (arm := told["arms"].get(key)) is not None
+    ]
+    yield table("Walks: mean over robots, with the deviation of all walks", columns, rows)
+    if any(method in part["walks"] for method in figures.METHODS):
+        yield figure(
+            figures.per_robot(part["walks"]), "Mean distance of each method on each robot."
+        )
+    rows = [(f"farther than {name}", estimated(one)) for name, one in told["above"].items()]
+    rows += [(name, estimated(one)) for name, one in told["ratios"].items()]
+    if rows:
+        columns = [Column("PUP against others", "words"), Column("Share or ratio", "number")]
+        yield table("Shares of robots, and ratios of mean distances", columns, rows)
+    yield from _searches(part)
+
+
+def _sd(value: float | None) -> str:
+    return MISSING if value is None else f"{value:.2f}"
+
+
+def _searches(part: Mapping[str, Any]) -> Iterator[Html]:
+    told = part["statistics"]["needed"]
+    if not told:
+        return
+    goals = [float(np.mean(w["distance"])) for w in part["walks"]["pup"].values()]
+    if max(goals) > 0:
+        yield figure(
+            figures.searches(part),
+            "Best walk so far over trials, for each search.",
+            "Median over robots of the best walk so far; bands: the middle half. A best walk is "
+            "one walk, and lucky: the tables tell what chosen etas come to.",
+        )
+    columns = [Column("Search", "words"), Column("Trials", "number")]
+    columns += [Column("Needed (median)", "number"), Column("Robots that got there", "number")]
+    rows = [
+        (
+            figures.NAMES.get(arm, arm),
+            str(one["trials"]),
+            MISSING if one["median"] is None else f"{one['median']:g}",
+            estimated(one["reached"]),
+        )
+        for arm, one in told.items()
+    ]
+    yield table(
+        "Trials until a walk came as far as 95 % of PUP's distance after all trials", columns, rows
+    )
+
+
+def _bounds(told: Mapping[str, Any]) -> Iterator[Html]:
+    yield figure(
+        figures.fleet_bounds(told),
+        "Bounds of the fleet in the search range, with the fits of single robots.",
+        "Grey: not identified by these recordings.",
+    )
+    histories = {name: np.array(values, float) for name, values in told["histories"].items()}
+    names = " and ".join(LABELS.get(name, name) for name in histories)
+    yield figure(
+        convergence(histories), f"Loss over generations, {names}.", f"Fit of all robots: {names}."
+    )
+    columns = [Column("Parameter"), Column("Lower", "number"), Column("Upper", "number")]
+    columns += [Column("Nominal", "number"), Column("Robots inside", "number")]
+    rows = [
+        (
+            p["name"],
+            *(f"{p[k]:.4g}" for k in ("lower", "upper", "nominal")),
+            f"{told['inside'][p['name']]:.0%}" if p["name"] in told["inside"] else MISSING,
+        )
+        for p in told["parameters"]
+    ]
+    yield table("Bounds, and the share of robots whose own fit lies within them", columns, rows)
+
+
+def _diagnosis(told: Mapping[str, Any]) -> Iterator[Html]:
+    found = told["diagnosis"]
+    robots = found["robots"]
+    held = {
+        robot: (1e3 * one["rmse_before"], 1e3 * one["rmse_after"])
+        for robot, one in robots.items()
+        if one["rmse_before"] is not None
+    }
+    if held:
+        yield figure(
+            figures.before_after(held, "error on motions left out, mrad"),
+            "Error on motions left out of each robot, before and after its diagnosis.",
+            f"Lower by {estimated(found['improvement'])} (median share).",
+        )
+    for direction, part in told["directions"].items():
+        before, after = (part["walks"].get(a, {}) for a in ("pup+fitted", "pup+corrected+fitted"))
+        pairs = {
+            robot: tuple(float(np.mean(w[robot]["distance"])) for w in (before, after))
+            for robot in before
+            if robot in after
+        }
+        if pairs:
+            yield figure(
+                figures.before_after(pairs, "distance without trials, m"),
+                f"Distance {direction} without trials, before and after the correction.",
+                f"{direction}: eta of the fitted parameters, before (fleet's policy) and after "
+                "(trained on in the corrected simulator).",
+            )
+    columns = [Column("Robot"), Column("Verdict"), Column("Classes named", "long")]
+    columns += [Column("Before [mrad]", "number"), Column("After", "number")]
+    rows = [
+        (
+            robot,
+            one["verdict"],
+            ", ".join(one["classes"]) or MISSING,
+            MISSING if one["rmse_before"] is None else f"{1e3 * one['rmse_before']:.2f}",
+            MISSING if one["rmse_after"] is None else f"{1e3 * one['rmse_after']:.2f}",
+        )
+        for robot, one in robots.items()
+    ]
+    yield table("Verdicts, and errors on motions left out", columns, rows)
+    columns = [Column("Named", "words"), Column("Share of robots", "number")]
+    rows = [(part, estimated(one)) for part, one in found["named"].items()]
+    rows += [(f"class {name}", estimated(one)) for name, one in found["classes"].items()]
+    yield table("Concealed parts and classes of effects that were named", columns, rows)
+
+
+def _real(told: Mapping[str, Any]) -> Iterator[Html]:
+    if told["histories"]:
+        histories = {name: np.array(v, float) for name, v in told["histories"].items()}
+        yield figure(convergence(histories), "Loss over generations of both torque laws.")
+    rivals = (told["diagnosis"] or {}).get("rivals")
+    if rivals:
+        yield figure(
+            figures.held_out(rivals["models"]),
+            "Errors of the models on motions left out.",
+            "Each type of motion left out in turn: what the other motions say of it.",
+        )
+
+
+def _provenance(told: Mapping[str, Any]) -> Iterator[Html]:
+    made, cells = told["written_by"], told["cells"]
+    engines = sorted({cell["source_sha256"][:12] for cell in cells.values()})
+    hosts = sorted({cell["host"] for cell in cells.values()})
+    seconds = sum(cell["seconds"] for cell in cells.values())
+    yield tag(
+        "p",
+        f"Robots {', '.join(map(str, told['plan']['seeds']))}. {len(cells)} cells, "
+        f"{seconds / 3600:.2f} hours in all on one core each, on {', '.join(hosts) or 'no host'}; "
+        f"sources {', '.join(engines) or MISSING}; report by commit {made['git_sha'] or 'none'}"
+        f"{' with changes' if made['dirty'] else ''}, {told['written']}.",
+    )
+    stopped = [
+        f"{name}: {why}"
+        for one in told["recordings"].values()
+        for name, why in one["stopped"].items()
+    ]
+    failures = [f"{name}: {why}" for name, why in told["failed"].items()] + stopped
+    yield tag("h3", "What failed")
+    yield tag("ul", *(tag("li", line) for line in failures or ["nothing"]))
+    columns = [Column("Cell"), Column("Took [s]", "number"), Column("Digest of what it found")]
+    rows = [(name, f"{c['seconds']:,.0f}", c["digest"][:16]) for name, c in cells.items()]
+    yield table("Cells; `pup experiment --cell NAME` does one again and compares", columns, rows)

@@ -1,0 +1,53 @@
+"""The verb: from options to a plan, to its cells, to what they found."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pup.errors import InputError
+from pup.files import write_json
+from pup.policy.shape import Method
+from services import places
+from services.experiment.cells import graph
+from services.experiment.plan import Plan, read_plan, small
+from services.experiment.run import complaint, run_again, run_cells
+from services.experiment.work import quiet
+from services.progress import counted
+
+EXPERIMENT, REPORT = "experiment.json", "report.html"
+
+
+def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
+    """Do an experiment, or one of its cells again.
+
+    Raises:
+      InputError: the plan cannot be done, or some of its cells failed.
+    """
+    from services.experiment.gather import gather
+    from services.experiment.report import write_report
+
+    quiet()
+    plan = plan_of(options)
+    cells = graph(plan, options.policies, options.real)
+    with places.cases(options) as (each, lanes), counted("experiment") as tell:
+        if options.cell is not None:
+            return run_again(cells, options.cell, out, each, lanes, tell)
+        failed = run_cells(cells, out, each, lanes, tell)
+    document = gather(plan, cells, failed, out.absolute())
+    write_json(out / EXPERIMENT, document)
+    write_report(document, out / REPORT)
+    if failed:
+        raise InputError(complaint(failed, out))
+    return {"experiment": document, "report": str(out / REPORT)}
+
+
+def plan_of(options: argparse.Namespace) -> Plan:
+    """The plan that the options mean."""
+    plan = small() if options.small else read_plan(options.plan) if options.plan else Plan()
+    plan = replace(plan, robot=options.robot)
+    known = tuple(Method)
+    if unknown := [m for m in options.methods or () if m not in known]:
+        raise InputError(f"--methods: {unknown[0]!r} is unknown; there are {', '.join(known)}")
+    plan = plan.of(options.seeds, options.methods)
+    return replace(plan, stages=options.stages) if options.stages else plan

@@ -1,0 +1,144 @@
+"""Numbers of an experiment against each other, and against what was to be shown."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from services.experiment.statistics import (
+    best_so_far,
+    estimate,
+    mean,
+    needed,
+    ratio,
+    share_above,
+    share_true,
+)
+
+ENOUGH = 0.95
+"""Share of the distance after all trials that counts as as far."""
+PUP = "pup"
+RIVALS = ("robust", "nominal", "up")
+RATIOS = {
+    **{f"{PUP} / {rival}": (PUP, rival) for rival in RIVALS},
+    "prior / trials": (f"{PUP}+prior", PUP),
+    "trials / no trials": (PUP, f"{PUP}+fitted"),
+    "corrected / fleet, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+fitted"),
+    "own / fleet, no trials": (f"{PUP}+own+fitted", f"{PUP}+fitted"),
+    "corrected / own, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+own+fitted"),
+    "corrected / fleet": (f"{PUP}+corrected", PUP),
+}
+"""Means that are compared, over the robots that have both."""
+
+
+def of_direction(part: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """Statistics of a direction.
+
+    Args:
+      part: its walks by arm and robot, and the distances of its searches.
+      seed: of the bootstrap.
+
+    Returns:
+      `arms`, the mean distance (m) and time (s) of each with the deviation of all walks; `above`,
+      the share of robots on which PUP comes farther; `ratios` of means; `needed`, trials until a
+      walk came as far as 95 % of what PUP comes after all trials.
+    """
+    walks = part["walks"]
+    above = {rival: _above(walks, [rival], seed) for rival in RIVALS if rival in walks}
+    if "robust" in walks and "nominal" in walks:
+        above["robust and nominal"] = _above(walks, ["robust", "nominal"], seed)
+    return {
+        "arms": {arm: _arm(told, seed) for arm, told in walks.items()},
+        "above": above,
+        "ratios": {
+            name: estimate(ratio, _means(walks, pair), seed).document()
+            for name, pair in RATIOS.items()
+            if all(arm in walks for arm in pair)
+        },
+        "needed": {arm: _needed(part, arm, seed) for arm in part["searches"] if PUP in walks},
+    }
+
+
+def _means(walks: Mapping[str, Any], arms: Sequence[str]) -> list[list[float]]:
+    """Mean distances of arms, a row for each robot that has walked all of them."""
+    robots = [r for r in walks[arms[0]] if all(r in walks[arm] for arm in arms)]
+    return [[float(np.mean(walks[arm][r]["distance"])) for arm in arms] for r in robots]
+
+
+def _above(walks: Mapping[str, Any], rivals: Sequence[str], seed: int) -> dict[str, Any]:
+    if PUP not in walks:
+        return estimate(share_above, []).document()
+    return estimate(share_above, _means(walks, [PUP, *rivals]), seed).document()
+
+
+def _arm(told: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    document: dict[str, Any] = {}
+    for name in ("distance", "time"):
+        rows = [[float(np.mean(walk[name]))] for walk in told.values()]
+        every = np.concatenate([walk[name] for walk in told.values()])
+        deviation = float(every.std(ddof=1)) if len(every) > 1 else None
+        within = [np.var(walk[name], ddof=1) for walk in told.values() if len(walk[name]) > 1]
+        document[name] = estimate(mean, rows, seed).document() | {
+            "std": deviation,
+            "std_of_a_robot": float(np.sqrt(np.mean(within))) if within else None,
+            "walks": len(every),
+        }
+    return document
+
+
+def _needed(part: Mapping[str, Any], arm: str, seed: int) -> dict[str, Any]:
+    """After how many trials the best walk comes as far as PUP's chosen eta does in the mean."""
+    goals = {r: ENOUGH * float(np.mean(w["distance"])) for r, w in part["walks"][PUP].items()}
+    told = {
+        robot: needed(best_so_far(distances), goals[robot])
+        for robot, distances in part["searches"][arm].items()
+        if robot in goals and distances
+    }
+    longest = max(map(len, part["searches"][arm].values()), default=0)
+    reached = estimate(share_true, [[float(n is not None)] for n in told.values()], seed)
+    counted = [n for n in told.values() if n is not None]
+    return {
+        "robots": told,
+        "trials": longest,
+        "median": float(np.median(counted)) if counted else None,
+        "reached": reached.document(),
+    }
+
+
+def acceptance(directions: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What was to be shown, and whether it was: a line for each bar."""
+    lines = []
+    for direction, part in directions.items():
+        told = part["statistics"]
+        above, ratios = told["above"], told["ratios"]
+        both = above.get("robust and nominal") or above.get("robust")
+        lines += [
+            _line(f"{direction}: robots on which PUP comes farther than its rivals", both, 0.8),
+            _line(f"{direction}: PUP by Robust", ratios.get("pup / robust"), 1.5),
+            _line(f"{direction}: PUP by Nominal", ratios.get("pup / nominal"), 2.0),
+            _line(
+                f"{direction}: few trials with a prior by all", ratios.get("prior / trials"), 0.95
+            ),
+            _line(
+                f"{direction}: no trials, corrected simulator by the fleet's",
+                ratios.get("corrected / fleet, no trials"),
+                1.3,
+            ),
+        ]
+    lines += [
+        _line(
+            "robots on which actuator and contact effects are named",
+            diagnosed["actuator_and_contact"],
+            0.8,
+        ),
+        _line("error held out is lower by (median)", diagnosed["improvement"], 0.5),
+    ]
+    return [line for line in lines if line["robots"]]
+
+
+def _line(name: str, told: Mapping[str, Any] | None, bar: float) -> dict[str, Any]:
+    known = told or {"value": None, "ci90": None, "robots": 0}
+    value = known["value"]
+    # A ratio to nothing has no number, and is above any bar.
+    holds = bool(known["robots"]) and (value is None or value >= bar)
+    return {"line": name, **known, "bar": bar, "holds": holds}

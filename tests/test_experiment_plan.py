@@ -1,0 +1,156 @@
+"""Plans of experiments, the cells that they mean, and what these depend on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import agents
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pup.errors import InputError
+from pup.locomotion.settings import Direction
+from pup.policy.shape import Method
+from services.experiment.cells import chosen, graph
+from services.experiment.plan import STAGES, Plan, Train, Walk, read_plan, small, training
+
+DOCUMENTED = Path(__file__).parents[1] / "docs" / "experiment.md"
+
+
+def test_the_plan_in_the_documentation_is_that_of_the_defaults(tmp_path: Path) -> None:
+    text = DOCUMENTED.read_text().split("```toml")[1].split("```")[0]
+    file = tmp_path / "plan.toml"
+    file.write_text(text)
+    assert read_plan(file) == Plan()
+    file.write_text("schema = 1\n")
+    assert read_plan(file) == Plan()
+
+
+REFUSED = {
+    "schema = 2": "this version reads schema = 1 only",
+    "schema = 1\nrobots = 3": "robots: unknown key",
+    "schema = 1\nseeds = []": "name each concealed robot once",
+    "schema = 1\nseeds = [1, 1]": "name each concealed robot once",
+    "schema = 1\nstages = ['walk']": "stage 'walk' is unknown",
+    "schema = 1\n[trials]\ntrials = -1": "trials.trials: -1 is below 0",
+    "schema = 1\n[trials]\ntrials = 0": "must be 1 or more",
+    "schema = 1\n[trials]\nwalks = 3": "trials.walks: unknown key",
+    "schema = 1\n[fleet]\ngenerations = 'x'": "expected a whole number",
+    "schema = 1\n[train]\nfleet = '--steps x'": "train: argument --steps",
+    "schema = 1\n[train]\nfleet = '--seed 3'": "--seed is the experiment's to say",
+    "schema = 1\n[[walk]]\ndirection = 'up'": "'up' is not a valid Direction",
+    "schema = 1\n[[walk]]\ndirection = 'forward'\nmethods = ['x']": "'x' is not a valid Method",
+    "schema = 1\n[[walk]]\ndirection = 'forward'\nrobots = 0": "needs a method and a robot",
+    "schema = 1\n[[walk]]\ndirection = 'forward'\n[[walk]]\ndirection = 'forward'": "stands twice",
+    "schema = 1\n[record]\nmotions = []": "a motion and a repeat at least",
+    "seeds": "not a TOML document",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_a_plan_cannot_say_is_told_in_a_line(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "plan.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"plan\.toml") as told:
+        read_plan(file)
+    assert REFUSED[text] in str(told.value) and "\n" not in str(told.value)
+
+
+PLANS = st.builds(
+    lambda seeds, walks, stages, control, rollouts: replace(
+        small(),
+        seeds=tuple(seeds),
+        walks=tuple(Walk(d, tuple(m), r) for d, (m, r) in walks.items()),
+        stages=tuple(stages),
+        control=control,
+        diagnosis=replace(small().diagnosis, rollouts=rollouts),
+    ),
+    st.lists(st.integers(0, 9999), min_size=1, max_size=4, unique=True),
+    st.dictionaries(
+        st.sampled_from(Direction),
+        st.tuples(st.lists(st.sampled_from(Method), min_size=1, unique=True), st.integers(1, 6)),
+        min_size=1,
+    ),
+    st.lists(st.sampled_from(STAGES), unique=True),
+    st.booleans(),
+    st.integers(0, 2),
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(PLANS)
+def test_cells_stand_behind_what_they_need_and_are_no_more_than_wanted(plan: Plan) -> None:
+    cells = graph(plan)
+    seen: set[str] = set()
+    for name, cell in cells.items():
+        assert name == cell.name and set(cell.needs.values()) <= seen
+        seen.add(name)
+    # Every robot that walks somewhere is there, and nobody else.
+    for walk in plan.walks:
+        for i, seed in enumerate(plan.seeds):
+            for method in walk.methods:
+                name = f"trials-r{seed}-{walk.direction}-{method}"
+                wanted = "trials" in plan.stages and i < walk.robots
+                assert not wanted or name in cells
+                assert i < walk.robots or name not in cells
+    own = [name for name in cells if name.endswith("-own")]
+    assert bool(own) <= plan.control
+    for name in list(cells)[:3]:
+        part = chosen(cells, [name])
+        assert list(part)[-1] == name and list(part) == [n for n in cells if n in part]
+        assert {n for c in part.values() for n in c.needs.values()} <= set(part)
+
+
+def test_the_default_plan_is_that_of_the_issue() -> None:
+    cells = graph(Plan())
+    walked = [n for n in cells if n.startswith("trials-")]
+    for direction, methods, robots in (("forward", 4, 10), ("backward", 2, 4), ("sideways", 2, 4)):
+        arms = {n.split("-", 3)[3] for n in walked if f"-{direction}-" in n}
+        searched = methods - 2 if methods == 4 else methods - 1
+        assert len(arms) == methods + searched + 2  # priors, the corrected and its control
+        assert sum(n.endswith(f"-{direction}-pup") for n in walked) == robots
+    assert sum(n.startswith("policy-") and "-r" not in n for n in cells) == 8
+    assert cells["presysid-fleet"].needs == {
+        f"recordings {s}": f"record-r{s}" for s in Plan().seeds
+    }
+
+
+def test_what_does_not_matter_to_a_cell_is_not_told_it() -> None:
+    """Other trials change no recording, fit or policy; another training changes no fit."""
+    first = graph(small())
+    trials = graph(replace(small(), trials=replace(small().trials, trials=4)))
+    changed = {n for n in first if first[n].told != trials[n].told}
+    ends = ("-pup", "-up", "-own", "-corrected")
+    assert changed == {n for n in first if n.startswith("trials-") and n.endswith(ends)}
+    longer = replace(small(), train=Train("--steps 2000", small().train.further))
+    changed = {n for n in first if first[n].told != graph(longer)[n].told}
+    assert changed == {f"policy-forward-{m}" for m in Method}
+
+
+def test_policies_that_are_there_are_taken(tmp_path: Path) -> None:
+    agents.bundle(tmp_path / "forward" / "pup")
+    agents.bundle(tmp_path / "forward" / "robust" / "policy", method=Method.ROBUST)
+    cells = graph(small(), tmp_path)
+    ready = {n for n, cell in cells.items() if "ready" in cell.told}
+    assert ready == {"policy-forward-pup", "policy-forward-robust"}
+    assert not any(cells[n].needs for n in ready)
+    told = cells["policy-forward-pup"].told
+    assert str(tmp_path) not in str(told)  # the same wherever it lies
+
+
+def test_some_robots_and_some_methods() -> None:
+    plan = Plan().of([7, 8, 9], ["pup", "nominal"])
+    assert plan.seeds == (7, 8, 9) and all(walk.robots == 3 for walk in plan.walks)
+    assert [walk.methods for walk in plan.walks] == [("pup", "nominal"), ("pup",), ("pup",)]
+    assert Plan().of(None, None) == Plan()
+
+
+def test_a_robot_without_a_gait_is_refused() -> None:
+    with pytest.raises(InputError, match="needs a gait"):
+        graph(replace(small(), robot="servo_bench"))
+
+
+def test_words_of_a_training() -> None:
+    assert training("--steps 5000 --minibatch 64").minibatch == 64
+    with pytest.raises(InputError, match="unrecognized arguments"):
+        training("--no-such-thing")

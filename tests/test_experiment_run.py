@@ -1,0 +1,252 @@
+"""Cells are done once, go on where they were, and two runs agree; and what is made of them."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import agents
+import experiments
+import numpy as np
+import pytest
+from commandline import pup
+from reports import Page
+
+from pup.errors import InputError
+from pup.files import write_json
+from pup.policy.bundle import NumpyPolicy
+from pup.policy.shape import Method
+from pup.robot import RobotDescription
+from services import places
+from services.experiment import work
+from services.experiment.cells import Cell, graph
+from services.experiment.gather import gather
+from services.experiment.plan import Plan, small
+from services.experiment.report import estimated, write_report
+from services.experiment.run import CELLS, FILES, run_again, run_cells
+from services.experiment.walking import conditioned
+
+ROBOT = RobotDescription.load("darwin_op2")
+
+
+def told(*_: Any) -> None:
+    """Nobody listens."""
+
+
+class Workshop:
+    """Kinds of cells that write down how often they are done, and stop or fail when told to."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+        self.stops: set[str] = set()
+        self.fails: set[str] = set()
+        self.chance: float = 0.0
+
+    def work(self, task: work.Task) -> dict[str, Any]:
+        name = task.cell.name
+        (task.out / "half").touch()
+        if name in self.stops:
+            raise KeyboardInterrupt
+        if name in self.fails:
+            raise InputError("it cannot be done")
+        self.done.append(name)
+        for left in work.LEFT.get(task.cell.kind, ()):
+            write_json(task.out / left, {})
+        return {"of": name, "chance": self.chance}
+
+
+@pytest.fixture
+def workshop(monkeypatch: pytest.MonkeyPatch) -> Workshop:
+    shop = Workshop()
+    monkeypatch.setattr("services.experiment.run.KINDS", dict.fromkeys(work.KINDS, shop.work))
+    return shop
+
+
+def do(cells: dict[str, Cell], out: Path) -> dict[str, str]:
+    return run_cells(cells, out, places.one_by_one, 1, told)
+
+
+def test_cells_are_done_once_and_again_when_something_changed(
+    workshop: Workshop, tmp_path: Path
+) -> None:
+    cells = graph(small())
+    assert do(cells, tmp_path) == {}
+    assert sorted(workshop.done) == sorted(cells)
+    place = {name: workshop.done.index(name) for name in cells}
+    assert all(place[n] < place[c.name] for c in cells.values() for n in c.needs.values())
+    assert do(cells, tmp_path) == {} and len(workshop.done) == len(cells)
+    plan = replace(small(), trials=replace(small().trials, landscape=8))
+    workshop.done.clear()
+    assert do(graph(plan), tmp_path) == {}
+    assert set(workshop.done) == {"landscape-forward-pup", "landscape-forward-up"}
+    # What came of it is what it was, so that nothing that needs it is done again.
+    (tmp_path / CELLS / "presysid-r1000" / FILES / "bounds.json").write_text("[]")
+    workshop.done.clear()
+    assert do(graph(plan), tmp_path) == {}
+    assert workshop.done == ["presysid-r1000"]
+
+
+def test_what_needs_another_result_is_done_again(workshop: Workshop, tmp_path: Path) -> None:
+    cells = graph(small())
+    do(cells, tmp_path)
+    workshop.done.clear()
+    workshop.chance = 1.0
+    (tmp_path / CELLS / "presysid-r1000" / FILES / "result.json").unlink()
+    do(cells, tmp_path)
+    behind = {n for n, c in cells.items() if "presysid-r1000" in c.needs.values()}
+    assert {"presysid-r1000", *behind} <= set(workshop.done)
+    assert not any("r1001" in name for name in workshop.done)
+
+
+def test_stopped_at_any_cell_it_goes_on_there(workshop: Workshop, tmp_path: Path) -> None:
+    cells = graph(small())
+    for name in ("record-r1001", "policy-forward-up", "trials-r1000-forward-corrected"):
+        workshop.stops = {name}
+        with pytest.raises(KeyboardInterrupt):
+            do(cells, tmp_path)
+        assert name not in workshop.done
+        assert (tmp_path / CELLS / name / FILES / "half").exists()
+    workshop.stops = set()
+    assert do(cells, tmp_path) == {}
+    assert sorted(workshop.done) == sorted(cells)  # each once
+
+
+def test_what_fails_is_told_and_tried_again_and_all_else_is_done(
+    workshop: Workshop, tmp_path: Path
+) -> None:
+    cells = graph(small())
+    workshop.fails = {"diagnosis-r1001"}
+    failed = do(cells, tmp_path)
+    behind = {n for n in cells if "r1001" in n and "corrected" in n}
+    assert set(failed) == {"diagnosis-r1001"} | behind
+    assert failed["diagnosis-r1001"] == "InputError: it cannot be done"
+    assert failed["presysid-r1001-corrected"] == "needs diagnosis-r1001"
+    error = json.loads((tmp_path / CELLS / "diagnosis-r1001" / "error.json").read_text())
+    assert "Traceback" in error["details"][0]
+    workshop.fails = set()
+    assert do(cells, tmp_path) == {}
+    assert not (tmp_path / CELLS / "diagnosis-r1001" / "error.json").exists()
+    assert sorted(workshop.done) == sorted(cells)
+
+
+def test_a_cell_is_done_again_beside_what_it_left(workshop: Workshop, tmp_path: Path) -> None:
+    cells, name = graph(small()), "trials-r1000-forward-robust"
+
+    def again() -> dict[str, Any]:
+        return run_again(cells, name, tmp_path, places.one_by_one, 1, told)
+
+    first = again()  # as on a fresh clone: what it needs is done too, and nothing else
+    assert first["agree"] and set(workshop.done) == set(needed(cells, name))
+    assert len(workshop.done) == len(set(workshop.done)) + 1
+    workshop.chance = 0.5
+    second = again()
+    assert not second["agree"] and workshop.done[-1] == name
+    assert len({*second["results"].values()}) == 2
+    assert do(cells, tmp_path) == {}
+    with pytest.raises(InputError, match="there is none"):
+        run_again(cells, "walk", tmp_path, places.one_by_one, 1, told)
+
+
+def needed(cells: dict[str, Cell], name: str) -> Iterator[str]:
+    yield name
+    for other in cells[name].needs.values():
+        yield from needed(cells, other)
+
+
+@contextmanager
+def made_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    def find(task: work.Task) -> dict[str, Any]:
+        for left in work.LEFT.get(task.cell.kind, ()):
+            write_json(task.out / left, {})
+        return experiments.result(task.cell)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("services.experiment.run.KINDS", dict.fromkeys(work.KINDS, find))
+        yield
+
+
+def test_the_document_and_the_report_tell_what_was_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    plan, real = Plan(), tmp_path / "real"
+    real.mkdir()
+    (real / "a.parquet").write_bytes(b"")
+    cells = graph(plan, real=real)
+    with made_up(monkeypatch):
+        assert do(cells, tmp_path) == {}
+    document = gather(plan, cells, {"policy-sideways-up": "needs <b>presysid</b>"}, tmp_path)
+    write_json(tmp_path / "experiment.json", document)
+    forward = document["directions"]["forward"]
+    assert len(forward["walks"]["pup"]) == 10 and len(forward["walks"]["pup+fitted"]) == 10
+    assert len(document["directions"]["sideways"]["walks"]["robust"]) == 4
+    walks = forward["walks"]
+    means = {a: np.mean([np.mean(w["distance"]) for w in walks[a].values()]) for a in walks}
+    arms = forward["statistics"]["arms"]
+    assert arms["pup"]["distance"]["value"] == pytest.approx(means["pup"])
+    assert arms["pup"]["distance"]["walks"] == 50
+    ratios = forward["statistics"]["ratios"]
+    assert ratios["pup / robust"]["value"] == pytest.approx(means["pup"] / means["robust"])
+    assert ratios["pup / robust"]["ci90"][0] < 1.2 / 0.7 < ratios["pup / robust"]["ci90"][1]
+    assert forward["statistics"]["above"]["robust and nominal"]["value"] >= 0.8
+    lines = {line["line"]: line for line in document["acceptance"]}
+    assert lines["forward: PUP by Nominal"]["holds"]
+    assert lines["error held out is lower by (median)"]["value"] == pytest.approx(0.55)
+    assert not [name for name in lines if "sideways: PUP by Nominal" in name]
+    named = document["diagnosis"]["robots"]
+    share = np.mean(["ground_compliance" in one["classes"] for one in named.values()])
+    assert document["diagnosis"]["named"]["contact"]["value"] == share
+    write_report(document, tmp_path / "report.html")
+    page = Page(tmp_path / "report.html")
+    assert not {"b", "script", "link"} & {name for name, _ in page.elements}
+    assert "needs <b>presysid</b>" in page.text and "stopped by overload: <b>" in page.text
+    images = [attributes["src"] for name, attributes in page.elements if name == "img"]
+    assert len(images) == 15 and all(i.startswith("data:image/svg+xml") for i in images)
+    assert estimated(ratios["pup / robust"]) in page.text
+
+
+def test_an_experiment_that_is_only_begun_is_reported_too(tmp_path: Path) -> None:
+    cells = graph(small())
+    failed = dict.fromkeys(cells, "needs record-r1000")
+    document = gather(small(), cells, failed, tmp_path)
+    write_json(tmp_path / "experiment.json", document)
+    assert document["acceptance"] == [] and document["bounds"] is None
+    write_report(document, tmp_path / "report.html")
+    assert "needs record-r1000" in Page(tmp_path / "report.html").text
+
+
+def test_a_policy_without_eta_acts_the_same_whatever_a_study_tells_it(tmp_path: Path) -> None:
+    robust = agents.bundle(tmp_path / "robust", lively=True, method=Method.ROBUST)
+    walked = conditioned(robust, tmp_path / "walked", ROBOT)
+    before, after = NumpyPolicy.load(robust, ROBOT), NumpyPolicy.load(walked, ROBOT)
+    assert after.card.shape.eta == len(after.card.eta_lower) == 1
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(50, before.card.shape.proprioception))
+    for eta in (-1.0, 0.0, 0.7):
+        assert np.array_equal(before.act(seen, np.zeros(0)), after.act(seen, np.array([eta])))
+    pup_ = agents.bundle(tmp_path / "pup")
+    assert conditioned(pup_, tmp_path / "nowhere", ROBOT) == pup_
+
+
+REFUSED = {
+    ("--robot", "servo_bench"): "needs a gait and servo ids",
+    ("--plan", "absent.toml"): "absent.toml: cannot be read",
+    ("--methods", "pup,best"): "'best' is unknown",
+    ("--stages", "walk"): "stage 'walk' is unknown",
+    ("--seeds", "1-x"): "is not A-B,...",
+    ("--seeds", "1,1"): "does not name robots, each once",
+    ("--cell", "../x"): "is no cell",
+    ("--real", "."): "no *.parquet",
+    ("--small", "--plan", "x"): "not allowed with argument",
+}
+
+
+@pytest.mark.parametrize("options", REFUSED)
+def test_mistakes_are_told_in_a_line(
+    options: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = pup("experiment", "--out", tmp_path / "out", "--local", *options)
+    assert done.code == 2 and REFUSED[options] in done.err, done.err
+    assert "Traceback" not in done.err and not (tmp_path / "out").exists()
