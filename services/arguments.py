@@ -4,6 +4,7 @@ import argparse
 from importlib.metadata import version
 from pathlib import Path
 
+from services.arguments_experiment import experiment
 from services.arguments_jobs import jobs, submit
 from services.arguments_policies import replay, serve, train, transfer, virtual_robot
 from services.arguments_recordings import blind, diagnose, export, import_logs, presysid, record
@@ -36,6 +37,11 @@ def parser(
         ("replay", "simulate recordings and compare, or let a policy walk", replay),
         ("diagnose", "say what physics the simulator leaves out, and model it", diagnose),
         ("blind", "make, diagnose or score a sealed set of concealed cases", blind),
+        (
+            "experiment",
+            "the paper's experiment on concealed robots; run again, it resumes",
+            experiment,
+        ),
         ("virtual-robot", "be a robot on pseudo-terminals, until stopped", virtual_robot),
     ):
         verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")

@@ -101,6 +101,12 @@ def _show_diagnosis(shown: dict[str, Any]) -> None:
     diagnosis_table(shown)
 
 
+def _show_experiment(shown: dict[str, Any]) -> None:
+    from services.tables import experiment_table
+
+    experiment_table(shown)
+
+
 def _show_life(shown: dict[str, Any]) -> None:
     print(f"{shown['robot']} lived for {shown['time']:.1f} s")
 
@@ -131,6 +137,7 @@ SHOWN = {
     "replay": _show_replay,
     "diagnose": _show_diagnosis,
     "blind": _show_blind,
+    "experiment": _show_experiment,
     "virtual-robot": _show_life,
 }
 """How the outcome of each verb is shown."""

@@ -9,10 +9,12 @@ from pup.errors import InputError
 from pup.robot import built_in_robots
 from services.arguments import parser
 
-Verb = Literal["import", "export", "record", "presysid", "train", "replay", "diagnose", "run"]
+Verb = Literal[
+    "import", "export", "record", "presysid", "train", "replay", "diagnose", "run", "experiment"
+]
 """Verbs that can be jobs: those that read and write files and end by themselves."""
 VERBS: tuple[Verb, ...] = get_args(Verb)
-RESUMABLE = ("presysid", "train", "diagnose", "run")
+RESUMABLE = ("presysid", "train", "diagnose", "run", "experiment")
 """Those that go on from what they find in their folder; others begin anew."""
 REFUSED = {
     "out": "a job has a folder of its own",

@@ -128,3 +128,25 @@ def diagnosis_table(document: dict[str, Any]) -> None:
         models = document["rivals"]["models"].items()
         told = ", ".join(f"{name} {1e3 * model['rmse']:.2f} mrad" for name, model in models)
         console.print(f"beside rivals: {told}", soft_wrap=True)
+
+
+def experiment_table(shown: dict[str, Any]) -> None:
+    """Print what an experiment came to, or whether a cell that was done again agrees."""
+    if "agree" in shown:
+        agrees = "agrees with what it found before" if shown["agree"] else "DIFFERS from before"
+        print(f"{shown['cell']}: done again, {agrees}")
+        for folder, digest in shown["results"].items():
+            print(f"{digest[:16]}  {folder}")
+        return
+    from services.experiment.report import estimated
+
+    console = Console(highlight=False)
+    table = Table(title="what was to be shown", title_justify="left")
+    table.add_column("line", overflow="fold")
+    for column in ("found", "robots", "bar", ""):
+        table.add_column(column, justify="right")
+    for line in shown["experiment"]["acceptance"]:
+        holds = "holds" if line["holds"] else "does not hold"
+        table.add_row(line["line"], estimated(line), str(line["robots"]), f"{line['bar']:g}", holds)
+    console.print(table)
+    print(f"report: {shown['report']}")

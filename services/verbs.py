@@ -248,6 +248,18 @@ def _blind(options: argparse.Namespace) -> dict[str, Any]:
         return blind.ACTIONS[options.action](options)
 
 
+def _experiment(options: argparse.Namespace) -> dict[str, Any]:
+    _service()
+    if find_spec("torch") is None or find_spec("gymnasium") is None:
+        raise InputError(
+            "the experiment trains policies with PyTorch and RLlib; install pup[learn]"
+        )
+    from services.experiment import verb
+
+    with _folder(options.out) as out:
+        return verb.run(options, out)
+
+
 def _virtual_robot(options: argparse.Namespace) -> dict[str, Any]:
     from services.virtual_robot import Wanted, serve
 
@@ -325,5 +337,6 @@ VERBS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "replay": _replay,
     "diagnose": _diagnose,
     "blind": _blind,
+    "experiment": _experiment,
     "virtual-robot": _virtual_robot,
 }

@@ -77,7 +77,7 @@ PLANS = st.builds(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(PLANS)
 def test_cells_stand_behind_what_they_need_and_are_no_more_than_wanted(plan: Plan) -> None:
     cells = graph(plan)
@@ -109,7 +109,8 @@ def test_the_default_plan_is_that_of_the_issue() -> None:
         searched = methods - 2 if methods == 4 else methods - 1
         assert len(arms) == methods + searched + 2  # priors, the corrected and its control
         assert sum(n.endswith(f"-{direction}-pup") for n in walked) == robots
-    assert sum(n.startswith("policy-") and "-r" not in n for n in cells) == 8
+    trained = [n for n in cells if n.startswith("policy-") and not n.startswith("policy-r1")]
+    assert len(trained) == 8
     assert cells["presysid-fleet"].needs == {
         f"recordings {s}": f"record-r{s}" for s in Plan().seeds
     }
