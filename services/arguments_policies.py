@@ -23,6 +23,7 @@ TRAINING = (
     ("--minibatch", (16, 2**20), int, 256, "samples of a gradient step"),
     ("--learning-rate", (1e-7, 1.0), float, 3e-4, "at the beginning"),
     ("--entropy", (0.0, 10.0), float, 0.0, "weight of exploration, falling to 0"),
+    ("--sharpen", (0.1, 10.0), float, 1.0, "by which exploration falls besides what is learnt"),
     ("--mirror", (0.0, 1000.0), float, 1.0, "weight of left-right symmetry; never sideways"),
 )
 """Numbers of a training: option, limits, kind, default and what it is."""

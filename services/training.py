@@ -118,6 +118,7 @@ def training_options(given: argparse.Namespace) -> Options:
         rate=given.learning_rate,
         schedule=given.schedule,
         weights=weights,
+        sharpen=given.sharpen,
     )
     return Options(
         method=Method(given.method),

@@ -138,6 +138,25 @@ def test_values_keep_their_meaning_when_returns_are_learnt() -> None:
     np.testing.assert_allclose(values(), before, rtol=1e-3, atol=1e-2)
 
 
+def test_a_sharper_policy_scatters_less_about_the_same_actions() -> None:
+    torch.manual_seed(0)
+    policy = ProjectedPolicy(PolicyShape.of(Method.PUP, *SIZES))  # a bell about the middle bins
+    seen, mu = (torch.from_numpy(a).float() for a in observations(50))
+
+    def spread() -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.no_grad():
+            chances = torch.softmax(policy(seen, mu), dim=-2)
+        bins = torch.arange(chances.shape[-2], dtype=chances.dtype)
+        mean = torch.einsum("nbj,b->nj", chances, bins)
+        return mean, torch.einsum("nbj,nbj->nj", chances, (bins[:, None] - mean[:, None]) ** 2)
+
+    mean, variance = spread()
+    policy.sharpen(1.5)
+    sharper = spread()
+    np.testing.assert_allclose(sharper[0], mean, atol=0.02)
+    np.testing.assert_allclose(sharper[1], variance / 1.5, rtol=0.05)
+
+
 def test_methods_see_what_they_should() -> None:
     """PUP through eta of three dimensions, UP mu itself, robust and nominal nothing of it."""
     seen, mu = (torch.from_numpy(a).float() for a in observations(20))

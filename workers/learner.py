@@ -36,6 +36,8 @@ class Learning:
       discount: of the future, gamma.
       decay: lambda of the advantages.
       weights: of the losses; that of the entropy falls to 0 over the training.
+      sharpen: by which the logits grow in the course of the training, beside what is learnt: the
+        less a policy explores, the faster it may walk without a fall.
       mirror: the robot's symmetry; None where the task does not have it.
       iterations: of the whole training.
       seed: of the order of samples.
@@ -51,6 +53,7 @@ class Learning:
     discount: float = 0.99
     decay: float = 0.95
     weights: LossWeights = field(default_factory=LossWeights)
+    sharpen: float = 1.0
     mirror: MirrorMap | None = None
     iterations: int = 1
     seed: int = 0
@@ -208,6 +211,7 @@ class MirrorLearner(PPOTorchLearner):
         seen, returns = module.shown
         module.policy.observations.update(seen)
         module.policy.learn_returns(returns)
+        module.policy.sharpen(self.learning.sharpen ** (1 / self.learning.iterations))
         del module.shown
         self.iteration += 1
         told = {name: float(torch.stack(v).mean()) for name, v in self._columns().items()}

@@ -111,6 +111,13 @@ class ProjectedPolicy(torch.nn.Module):
         return self.critic(torch.cat([self.observations(proprioception), known], dim=-1))[..., 0]
 
     @torch.no_grad()
+    def sharpen(self, factor: float) -> None:
+        """Multiply all logits: above one, actions scatter less about what they are on average."""
+        last = self.actor[-1]
+        last.weight.mul_(factor)
+        last.bias.mul_(factor)
+
+    @torch.no_grad()
     def learn_returns(self, returns: Tensor) -> None:
         """Take returns, shape (n,), into account without a change of what values mean.
 
