@@ -44,6 +44,8 @@ NAMES = {
 }
 """What arms are called where people read."""
 METHODS = tuple(COLOURS)
+FURTHER = {"own": PURPLE, "corrected": GREEN}
+"""Colours of policies that were trained on."""
 QUANTITIES = {"distance": "distance, m", "time": "time before the fall, s"}
 
 
@@ -58,11 +60,10 @@ def walked(directions: Mapping[str, Any], quantity: str) -> Drawing:
     axes = figure.subplots()
     wide = 0.8 / len(METHODS)
     for i, part in enumerate(directions.values()):
-        for k, method in enumerate(METHODS):
-            told = part["statistics"]["arms"].get(method)
-            if told is None:
-                continue
-            at, bar = i - 0.4 + (k + 0.5) * wide, told[quantity]
+        arms = part["statistics"]["arms"]
+        there = [method for method in METHODS if method in arms]
+        for k, method in enumerate(there):
+            at, bar = i + (k - (len(there) - 1) / 2) * wide, arms[method][quantity]
             axes.bar(at, bar["value"], wide * 0.9, color=COLOURS[method], alpha=0.75)
             axes.errorbar(at, bar["value"], yerr=bar["std"] or 0, color=INK, capsize=2.5, lw=1)
             means = [float(np.mean(w[quantity])) for w in part["walks"][method].values()]
@@ -105,6 +106,7 @@ def per_robot(walks: Mapping[str, Any]) -> Drawing:
             middle, at, xerr=spread, fmt="o", ms=4, lw=0.9, color=COLOURS[arm], label=NAMES[arm]
         )
     _rows(axes, robots)
+    axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
     axes.set_xlabel("distance, m (bars: deviation of the walks)")
     axes.grid(axis="x")
     figure.legend(loc="outside upper left", ncols=4, fontsize=8)
@@ -126,16 +128,15 @@ def searches(part: Mapping[str, Any]) -> Drawing:
             for robot, distances in told.items()
             if distances and goals.get(robot, 0) > 0
         ]
-        if not shares or arm not in NAMES:
+        if not shares:
             continue
         shortest = min(map(len, shares))
         drawn = np.array([share[:shortest] for share in shares])
-        trial, method = np.arange(1, shortest + 1), arm.partition("+")[0]
-        dash = "--" if "prior" in arm else ":" if arm != method else "-"
-        colour = GREEN if "corrected" in arm else PURPLE if "own" in arm else COLOURS[method]
+        trial, (method, _, more) = np.arange(1, shortest + 1), arm.partition("+")
+        colour, dash = FURTHER.get(more, COLOURS[method]), "--" if more == "prior" else "-"
         low, high = np.quantile(drawn, [0.25, 0.75], axis=0)
         axes.fill_between(trial, low, high, color=colour, alpha=0.1, lw=0)
-        axes.plot(trial, np.median(drawn, axis=0), dash, color=colour, label=NAMES[arm], ms=3)
+        axes.plot(trial, np.median(drawn, axis=0), dash, color=colour, label=NAMES[arm])
     axes.axhline(0.95, color=PALE, lw=1)
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -170,7 +171,7 @@ def fleet_bounds(bounds: Mapping[str, Any]) -> Drawing:
     axes.set_xlim(-0.01, 1.01)
     axes.set_xlabel("search range (0: lower end, 1: upper end)")
     axes.grid(axis="x")
-    figure.legend(loc="outside upper left", ncols=3, fontsize=8)
+    figure.legend(loc="outside upper left", ncols=2, fontsize=8)
     return as_svg(figure)
 
 
