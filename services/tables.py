@@ -92,7 +92,7 @@ def walk_table(document: dict[str, Any]) -> None:
     print(
         f"{document['episodes']} episodes with parameters from the bounds: median "
         f"{document['distance_median']:.2f} m in {document['time_median']:.1f} s, "
-        f"{document['upright_share']:.0%} without a fall"
+        f"{document['upright_share']:.0%} without a fall, {document['aside_median']:.2f} m aside"
     )
     print(f"video: {document['video']}, drawn by {document['drawn_by']}")
 

@@ -275,3 +275,14 @@ def test_a_policy_is_judged_by_one_episode_of_each_simulation() -> None:
     walks = evaluate(lambda seen, parameters: idle(len(seen)), standing)
     assert not walks.fell.any() and (walks.time >= 1.0).all()
     assert walks.summary()["upright_share"] == 1.0
+
+
+@pytest.mark.parametrize("aside", [-0.4, 0.4])
+def test_a_robot_off_its_course_ends_an_episode_of_a_training_only(aside: float) -> None:
+    for settings in (EXACT, EXACT.evaluation()):
+        task = walking(settings, n=2, robot=standing_robot())
+        task.reset()
+        task._episodes.start[1, 1] -= aside  # as if it had come from there
+        step = task.step(idle(2))
+        assert step.terminated.tolist() == [False, settings.on_course]
+        np.testing.assert_allclose(step.aside, [0.0, aside], atol=0.01)

@@ -20,6 +20,7 @@ class Walks:
     Attributes:
       parameters: true mu on the unit scale of the bounds, shape (n, n_parameters).
       distance: in the direction, m.
+      aside: across it, m.
       time: before the fall, or the whole episode's, s.
       fell: whether it ended otherwise than by time.
       reward: sum over the episode.
@@ -27,6 +28,7 @@ class Walks:
 
     parameters: NDArray[np.float32]
     distance: Array
+    aside: Array
     time: Array
     fell: NDArray[np.bool_]
     reward: Array
@@ -37,9 +39,10 @@ class Walks:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def summary(self) -> dict[str, float]:
-        """Median distance and time, share without a fall, mean reward."""
+        """Median distance, way aside and time, share without a fall, mean reward."""
         return {
             "distance_median": float(np.median(self.distance)),
+            "aside_median": float(np.median(np.abs(self.aside))),
             "time_median": float(np.median(self.time)),
             "upright_share": float(1 - self.fell.mean()),
             "reward_mean": float(self.reward.mean()),
@@ -58,14 +61,15 @@ def evaluate(policy: Policy, task: WalkingTask) -> Walks:
     seen = task.reset()
     parameters = seen.true_parameters
     reward, going = np.zeros(task.n), np.ones(task.n, dtype=bool)
-    distance, time = np.zeros(task.n), np.zeros(task.n)
+    distance, aside, time = np.zeros((3, task.n))
     fell = np.zeros(task.n, dtype=bool)
     while going.any():
         step = task.step(policy(seen.proprioception, seen.parameters))
         reward += np.where(going, step.reward, 0.0)
         distance = np.where(going, step.distance, distance)
+        aside = np.where(going, step.aside, aside)
         time = np.where(going, step.time, time)
         fell |= going & step.terminated
         going &= ~(step.terminated | step.truncated)
         seen = step.observation
-    return Walks(parameters, distance, time, fell, reward)
+    return Walks(parameters, distance, aside, time, fell, reward)

@@ -41,6 +41,9 @@ class TaskSettings:
     Attributes:
       direction: where to walk.
       horizon: longest episode, s (authors: the schedule of 14 s).
+      on_course: whether an episode ends where the robot is off its course by the gait's limit
+        (authors). In an evaluation it goes on: the robot cannot see its heading, and to stray is
+        no fall.
       bins: values that an action has per joint (paper, VI-A).
       smoothing: actions in the moving average that moves the targets (authors).
       control_rate: range of the control rate, drawn per episode, Hz (paper, VI-B).
@@ -64,6 +67,7 @@ class TaskSettings:
 
     direction: Direction = Direction.FORWARD
     horizon: float = 14.0
+    on_course: bool = True
     bins: int = 11
     smoothing: int = 5
     control_rate: tuple[float, float] = (25.0, 33.0)
@@ -83,8 +87,8 @@ class TaskSettings:
     substeps: int = 8
 
     def evaluation(self) -> "TaskSettings":
-        """The same task with the policy told the true parameters."""
-        return replace(self, parameter_noise=0.0)
+        """The same task to its end or a fall, with the policy told the true parameters."""
+        return replace(self, parameter_noise=0.0, on_course=False)
 
     def without_noise(self) -> "TaskSettings":
         """The same task with exact readings, one start, and the mean control rate."""

@@ -60,6 +60,7 @@ class Step:
       live: False where the step was the reset that follows an end: the action was ignored, the
         reward is 0, and the observation is the first of the new episode.
       distance: way in the direction since the start of the episode, m.
+      aside: way across it, m.
       time: since the start of the episode, s.
     """
 
@@ -69,6 +70,7 @@ class Step:
     truncated: Flags
     live: Flags
     distance: Array
+    aside: Array
     time: Array
 
 
@@ -205,6 +207,7 @@ class WalkingTask:
             truncated=truncated,
             live=live,
             distance=(episodes.place - episodes.start)[:, :2] @ self._axis,
+            aside=(episodes.place - episodes.start)[:, :2] @ self._across,
             time=episodes.time.copy(),
         )
 
@@ -288,9 +291,13 @@ class WalkingTask:
             motion.lost
             | motion.touching
             | (tilt > self.gait.tilt_limit)
-            | (np.abs(moved[:, :2] @ self._across) > self.gait.drift_limit)
+            | self._off_course(moved)
             | (np.abs(moved[:, 2]) > self.gait.drift_limit)
         )
+
+    def _off_course(self, moved: Array) -> Flags:
+        aside = np.abs(moved[:, :2] @ self._across)
+        return np.asarray(self.settings.on_course & (aside > self.gait.drift_limit))
 
     def _reward(self, motion: Motion, reference: Array, speed: Array) -> Array:
         """The paper's reward (section VI-A) less the authors' cost of swaying."""
