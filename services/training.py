@@ -323,15 +323,18 @@ class _Job:
         )
 
     def _told_options(self) -> dict[str, Any]:
-        """The options as JSON values, without what follows from the robot."""
+        """The options as JSON values, without what follows from the robot.
+
+        A path to the first policy means nothing elsewhere: `origin` tells which one it was.
+        """
         told = asdict(replace(self.options, learning=replace(self.options.learning, mirror=None)))
-        del told["learning"]["mirror"]
+        del told["learning"]["mirror"], told["start"]
         return dict(json.loads(json.dumps(told, default=str)))
 
     def _digest(self) -> str:
         """Of all that the weights depend on."""
         told = self._told_options()
-        del told["track"], told["start"]
+        del told["track"]
         if self.options.engine is Engine.MUJOCO:
             del told["engine"]  # as before there were two
         first = hashlib.sha256()
