@@ -17,6 +17,9 @@ CHROMIUM = (
 )
 NEEDED = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
 PHONE = {"width": 390, "height": 844}
+SIZES = {"wide": {"width": 1280, "height": 900}, "phone": PHONE}
+AXE = os.environ.get("PUP_AXE")
+"""File axe.min.js of axe-core, where accessibility is to be checked by it."""
 SHOTS = os.environ.get("PUP_SHOTS")
 """Folder for pictures of the pages, where they are wanted."""
 
@@ -73,3 +76,17 @@ def shot(page: Any, name: str) -> None:
     if SHOTS:
         Path(SHOTS).mkdir(parents=True, exist_ok=True)
         page.screenshot(path=f"{SHOTS}/{name}.png", full_page=True)
+
+
+def check(page: Any, path: str, size: str) -> None:
+    """That a page fits on its screen, and that axe finds nothing."""
+    page.goto(path)
+    page.locator("h1").wait_for()
+    wide = page.evaluate("document.documentElement.scrollWidth")
+    assert wide <= SIZES[size]["width"], f"{path} is wider than the screen"
+    shot(page, f"{size}{path.replace('/', '_')}")
+    if AXE:
+        page.evaluate(Path(AXE).read_text())
+        found = page.evaluate("axe.run()")["violations"]
+        told = [(v["id"], v["nodes"][0]["html"][:200]) for v in found]
+        assert told == [], path

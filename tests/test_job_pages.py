@@ -1,6 +1,5 @@
 """The pages of jobs in a real headless Chromium: states, log, artefacts, buttons, on a phone."""
 
-import os
 from pathlib import Path
 
 import gateways
@@ -11,9 +10,6 @@ import stored_jobs
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
 
-AXE = os.environ.get("PUP_AXE")
-"""File axe.min.js of axe-core, where accessibility is to be checked by it."""
-SIZES = {"wide": {"width": 1280, "height": 900}, "phone": pages.PHONE}
 PATHS = ("/jobs", *(f"/jobs/{job.id}" for job in stored_jobs.ALL))
 pytestmark = pages.NEEDED
 
@@ -40,20 +36,11 @@ def open_page(browser, service):
         yield opened
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", pages.SIZES)
 def test_every_page_fits_and_is_accessible(open_page, size):
-    page = open_page(viewport=SIZES[size])
+    page = open_page(viewport=pages.SIZES[size])
     for path in PATHS:
-        page.goto(path)
-        page.locator("h1").wait_for()
-        wide = page.evaluate("document.documentElement.scrollWidth")
-        assert wide <= SIZES[size]["width"], f"{path} is wider than the screen"
-        pages.shot(page, f"{size}{path.replace('/', '_')}")
-        if AXE:
-            page.evaluate(Path(AXE).read_text())
-            found = page.evaluate("axe.run()")["violations"]
-            told = [(v["id"], v["nodes"][0]["html"][:200]) for v in found]
-            assert told == [], path
+        pages.check(page, path, size)
 
 
 def test_a_job_is_told_with_its_log_and_files(open_page):
