@@ -200,7 +200,8 @@ class Conductor:
             return "enable"
         if status.senses is not None:
             hottest = np.nanmax(np.append(status.senses.temperature, -273.0))
-            if hottest > self._settings.safety.cool:
+            safety = self._settings.safety
+            if hottest > safety.cool or status.heat > safety.rested:
                 return "cool"
         if self._settings.control.gate == "operator" and not self._armed:
             return "arm"

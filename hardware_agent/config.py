@@ -114,8 +114,10 @@ class SafetySettings:
       cool: below which a trial starts, °C.
       heating: °C/s over `heating_time`: the sensor is far from the winding.
       heating_time: s.
-      current: largest root mean square of a motor's current, as a share of the stall current.
+      current: largest root mean square of a motor's current, as a share of the stall current: a
+        stalled motor is given up after 11 s, a knee that walks at 0.8 after 21 s.
       current_time: over which it is taken, s.
+      rested: share of that heat (I²t) below which a trial starts.
       duty_per_radian: of the servo's P gain, to tell the current (fitted, MX-28 at P 32).
       free_speed: without load, rad/s, likewise.
       lag: time constant with which a joint follows its target, s, likewise.
@@ -135,8 +137,9 @@ class SafetySettings:
     cool: float = 60.0
     heating: float = 0.5
     heating_time: float = 10.0
-    current: float = 0.5
+    current: float = 0.65
     current_time: float = 20.0
+    rested: float = 0.4
     duty_per_radian: float = 6.28
     free_speed: float = 3.9
     lag: float = 0.05

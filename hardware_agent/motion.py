@@ -348,6 +348,7 @@ class Motion(threading.Thread):
             repeated=self._body.repeated,
             lost=self._body.lost,
             limited=self._limited,
+            heat=self._body.guard.heat,
         )
 
     def _realtime(self) -> None:

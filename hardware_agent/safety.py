@@ -213,19 +213,29 @@ class Overload:
         self.reset()
 
     def reset(self) -> None:
-        """See Rule: but a winding stays hot while torque is off, so it forgets nothing."""
-        self._last: Senses | None = None
+        """See Rule: a winding forgets nothing, but it cools while torque is off."""
+        self._on = False
 
     _heat: Array | None = None
+    _last: Senses | None = None
+    _on = False
+
+    @property
+    def heat(self) -> float:
+        """The hottest winding's, as a share of what is allowed."""
+        return 0.0 if self._heat is None else float(self._heat.max()) / self._limits.current**2
 
     def check(self, senses: Senses) -> str | None:
         """See Rule."""
         limits, last, self._last = self._limits, self._last, senses
-        if last is None:
-            if self._heat is None:
-                self._heat = np.zeros(len(senses.names))
+        if last is None or self._heat is None:
+            self._heat = np.zeros(len(senses.names))
             return None
         step = senses.time - last.time
+        if not self._on:
+            self._on = True
+            self._heat *= math.exp(-max(step, 0.0) / limits.current_time)
+            return None
         speed = (senses.position - last.position) / max(step, 1e-3)
         duty = np.clip(limits.duty_per_radian * (last.goal - senses.position), -1.0, 1.0)
         current = np.nan_to_num(duty - speed / limits.free_speed)
@@ -327,6 +337,11 @@ class Guard:
         """Torque comes on."""
         for rule in self.rules:
             rule.reset()
+
+    @property
+    def heat(self) -> float:
+        """Of the motors' windings (I²t), as a share of what is allowed."""
+        return max(rule.heat for rule in self.rules if isinstance(rule, Overload))
 
     def check(self, senses: Senses) -> Trip | None:
         """The first rule that is broken; every rule sees every tick."""

@@ -21,6 +21,7 @@ class MotionStatus:
       repeated: questions to servos that had to be repeated, so far.
       lost: answers that did not come in spite of it.
       limited: what held the latest target back, by joint.
+      heat: of the hottest winding (I²t), as a share of what is allowed.
     """
 
     state: AgentState
@@ -32,6 +33,7 @@ class MotionStatus:
     repeated: int
     lost: int
     limited: dict[str, str]
+    heat: float
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ TRIPS: dict[str, tuple[str, Any, str]] = {
     "a joint that pushes against a stop": (
         "overload",
         lambda t: {"goal": POSE + at(1, 0.3, 0.0), "position": POSE + 0.001 * (t % 0.06 > 0.03)},
-        "knee draws 0.5",
+        "knee draws 0.65",
     ),
     "an encoder that sticks": (
         "stuck encoder",
@@ -157,19 +157,32 @@ def test_it_stops_the_robot(rule: str, changes: Any, told: str) -> None:
     assert trip.response is (Response.SOFT if rule == "fall" else Response.LIMP)
 
 
-def test_a_motor_may_give_much_for_a_moment_but_not_for_long() -> None:
-    """Half of the stall current for 20 s is the limit: the full one takes 6 s to it."""
+def pushed(t: float) -> dict[str, Any]:
+    """A knee that stands against something at full power."""
+    return {"goal": POSE + at(1, 0.3, 0.0), "position": POSE + 0.001 * (t % 0.06 > 0.03)}
 
-    def pushed(t: float) -> dict[str, Any]:
-        return {
-            "goal": POSE + at(1, 0.3, 0.0),
-            "position": POSE + 0.001 * (t % 0.06 > 0.03),
-        }
 
-    guard = Guard(LIMITS, 1.0)
+def given_up(guard: Guard, begin: float) -> float:
+    """Time for which a stalled motor is pushed before it is given up, s."""
     times = np.arange(0.0, 30.0, PERIOD)
-    first = next(t for t in times if guard.check(senses(10.0 + t, **pushed(t))) is not None)
-    assert first == pytest.approx(-20 * math.log(1 - 0.25), rel=0.05)
+    return next(t for t in times if guard.check(senses(begin + t, **pushed(t))) is not None)
+
+
+def test_a_motor_may_give_much_for_a_moment_but_not_for_long() -> None:
+    """0.65 of the stall current for 20 s is the limit: the full one takes 11 s to it."""
+    guard = Guard(LIMITS, 1.0)
+    assert given_up(guard, 10.0) == pytest.approx(-20 * math.log(1 - 0.65**2), rel=0.05)
+    assert guard.heat == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("rest", [0.0, 20.0, 200.0])
+def test_a_winding_cools_while_torque_is_off_and_no_faster(rest: float) -> None:
+    guard = Guard(LIMITS, 1.0)
+    on = 10.0 + given_up(guard, 10.0) + rest
+    guard.reset()
+    left = 0.65**2 * math.exp(-rest / 20)
+    expected = 20 * math.log((1 - left) / (1 - 0.65**2))
+    assert given_up(guard, on) == pytest.approx(expected, abs=0.2)
 
 
 def test_one_servo_that_lies_about_the_voltage_stops_nobody() -> None:
