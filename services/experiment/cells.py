@@ -1,7 +1,7 @@
 """The cells of an experiment: runs that stand alone, each told by what it depends on."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from pup.files import sha256
 from pup.policy.bundle import CARD
 from pup.policy.shape import Method
 from pup.robot import RobotDescription
-from services.experiment.plan import Plan, Walk, training
+from services.experiment.plan import Fits, Plan, Walk, training
 
 FLEET = "presysid-fleet"
 SEARCHED = (Method.PUP, Method.UP)
@@ -121,10 +121,13 @@ class _Graph:
         weight = 10.0 * len(record.motions) * record.repeats
         self._add(Cell(f"record-r{seed}", "record", {}, told, self._given(), weight))
 
-    def _presysid(self, name: str, fits: Any, needs: Mapping[str, str]) -> None:
-        told = self._told(fits=asdict(fits))
+    def _presysid(self, name: str, fits: Fits, needs: Mapping[str, str]) -> None:
+        told = self._fitted(fits)
         weight = 0.2 * fits.generations * fits.population * len(needs)
         self._add(Cell(name, "presysid", dict(needs), told, self._given(), weight))
+
+    def _fitted(self, fits: Fits) -> dict[str, Any]:
+        return self._told(fits=asdict(fits), motions=self.plan.record.fitted)
 
     def _policy(self, walk: Walk, method: Method) -> None:
         name, train = f"policy-{walk.direction}-{method}", self.plan.train
@@ -183,9 +186,9 @@ class _Graph:
             refit = f"presysid-r{seed}-corrected"
             if refit not in self._cells:
                 # NN-PD beside the effects: the same parameters as the policy that is trained on.
-                fits = asdict(self.plan.presysid) | {"compare": False}
+                told = self._fitted(replace(self.plan.presysid, compare=False))
                 needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
-                self._add(Cell(refit, "presysid", needs, self._told(fits=fits), self._given(), 1e3))
+                self._add(Cell(refit, "presysid", needs, told, self._given(), 1e3))
             own = {"bounds": f"presysid-r{seed}"}
             corrected = {"bounds": refit, "robot": f"diagnosis-r{seed}"}
             ways = {"corrected": corrected} | ({"own": own} if self.plan.control else {})

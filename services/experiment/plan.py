@@ -17,6 +17,7 @@ LIMIT = 2**18  # bytes of a plan
 ALL = tuple(Method)
 STAGES = ("record", "presysid", "policy", "trials", "prior", "diagnosis", "corrected")
 """What can be left out; what a stage needs is done in any case."""
+FITS = Fits(generations=100, subset_generations=50)
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,16 @@ class Recorded:
     Attributes:
       motions: as of `pup record`; all robots play the same scripts.
       repeats: how often each is played, which tells the noise.
+      fitted: types of motion that pre-sysID is given (the paper's); a diagnosis may see more.
     """
 
     motions: tuple[str, ...] = (
-        *("step:0.1", "step:0.3", "step:0.6") * 3,
+        *("step:0.1", "step:0.3", "step:0.6") * 2,
         *("hold", "triangle", "standup:1.75", "standup:4"),
         *("fall:forward", "fall:backward", "fall:left", "fall:right"),
     )
     repeats: int = 1
+    fitted: tuple[str, ...] = ("step", "standup", "fall")
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,9 @@ class Train:
 class _Refusing(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        raise InputError(message or "is no training")
 
 
 def training(words: str) -> argparse.Namespace:
@@ -151,8 +157,8 @@ class Plan:
         Walk(Direction.SIDEWAYS, (Method.PUP, Method.ROBUST), 4),
     )
     record: Recorded = field(default_factory=Recorded)
-    presysid: Fits = field(default_factory=lambda: Fits(generations=200, compare=False))
-    fleet: Fits = field(default_factory=lambda: Fits(generations=200, subsets=20, fraction=0.02))
+    presysid: Fits = field(default_factory=lambda: replace(FITS, compare=False))
+    fleet: Fits = field(default_factory=lambda: replace(FITS, subsets=20, fraction=0.02))
     train: Train = field(default_factory=Train)
     trials: Trials = field(default_factory=Trials)
     diagnosis: Diagnosed = field(default_factory=Diagnosed)

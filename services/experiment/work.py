@@ -62,7 +62,10 @@ class Task:
         if "recordings" in self.cell.given:
             folders = [Path(self.cell.given["recordings"])]
         read = load_recordings(folders, self.robot)
-        return tuple(r for r in read if not motions or r.motion in motions)
+        found = tuple(r for r in read if not motions or r.motion in motions)
+        if not found:
+            raise InputError(f"no recording of {', '.join(motions)}; was every script stopped?")
+        return found
 
 
 def record(task: Task) -> dict[str, Any]:
@@ -102,7 +105,8 @@ def presysid(task: Task) -> dict[str, Any]:
     from workers.fits import LocalRunner
 
     options = Options(**task.told["fits"])
-    wanted = task.simulated, task.recordings(), options, task.out, LocalRunner()
+    recordings = task.recordings(tuple(task.told["motions"]))
+    wanted = task.simulated, recordings, options, task.out, LocalRunner()
     told = identify(*wanted, lambda stage, statuses: None, 1).document()
     kept = ("parameters", "actuator", "loss", "histories", "splits")
     return {name: told[name] for name in kept}
