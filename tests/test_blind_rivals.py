@@ -15,7 +15,7 @@ from diagnosis_cases import BENCH
 from benchmarks import blind_rivals
 from benchmarks.rivals.case import Case
 from benchmarks.rivals.network import FILE, SHARE, Network, in_the_loop
-from benchmarks.rivals.refits import LADDER, chosen, refitted
+from benchmarks.rivals.refits import LADDER, _starts, chosen, refitted, with_effect
 from benchmarks.rivals.sparse import DICTIONARY, Problem, _law
 from benchmarks.rivals.torques import seen
 from pup.blind.make import make_set
@@ -143,6 +143,14 @@ def test_of_exhaustive_refits_bic_chooses_the_truth(case: Case) -> None:
     assert verdict.fit is not None
     told = verdict.fit.values["coulomb_friction/torque@joint:servo"]
     assert told == pytest.approx(0.03, rel=0.15)
+
+
+def test_refits_start_within_their_ranges(case: Case) -> None:
+    base = case.nominal.fit
+    for hypothesis in hypotheses(case.measured):
+        fit = with_effect(base, hypothesis)
+        for at in _starts(hypothesis, fit, len(base.at)):
+            assert all(c.lower <= x <= c.upper for c, x in zip(fit.coordinates, at, strict=True))
 
 
 def test_inverse_dynamics_finds_a_torque_that_brakes(case: Case) -> None:

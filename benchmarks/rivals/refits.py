@@ -135,14 +135,14 @@ def with_effect(base: Fit, hypothesis: Hypothesis) -> Fit:
 
 def _starts(hypothesis: Hypothesis, fit: Fit, known: int) -> list[Array]:
     """Places to start at: sizes of the effect, of both signs where it has two."""
-    count = len(hypothesis.magnitudes)
-    upper = np.array([c.upper for c in fit.coordinates[known : known + count]])
+    own = slice(known, known + len(hypothesis.magnitudes))
+    lower, upper = (np.array([getattr(c, e) for c in fit.coordinates]) for e in ("lower", "upper"))
     sizes = [s for size in SIZES for s in ((size, -size) if hypothesis.signed else (size,))]
     places = []
     for size in sizes:
         at = fit.at.copy()
-        at[known : known + count] = np.clip(size, -upper, upper)
-        places.append(at)
+        at[own] = size  # what has several magnitudes may have some that are not signed
+        places.append(np.clip(at, lower, upper))
     return places
 
 
