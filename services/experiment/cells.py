@@ -118,12 +118,12 @@ class _Graph:
     def _record(self, seed: int) -> None:
         record = self.plan.record
         told = self._told(character=seed, motions=record.motions, repeats=record.repeats)
-        weight = 10.0 * len(record.motions) * record.repeats
+        weight = 5.0 * len(record.motions) * record.repeats
         self._add(Cell(f"record-r{seed}", "record", {}, told, self._given(), weight))
 
     def _presysid(self, name: str, fits: Fits, needs: Mapping[str, str]) -> None:
         told = self._fitted(fits)
-        weight = 0.2 * fits.generations * fits.population * len(needs)
+        weight = 60 + 0.3 * fits.generations * fits.population * len(needs)
         self._add(Cell(name, "presysid", dict(needs), told, self._given(), weight))
 
     def _fitted(self, fits: Fits) -> dict[str, Any]:
@@ -137,7 +137,7 @@ class _Graph:
             self._add(Cell(name, "policy", {}, told, given))
             return
         told = self._told(method=method, direction=walk.direction, training=train.fleet)
-        needs, weight = {"bounds": FLEET}, training(train.fleet).steps / 5000
+        needs, weight = {"bounds": FLEET}, 20 + training(train.fleet).steps / 5000
         self._add(Cell(name, "policy", needs, told, self._given(), weight))
 
     def _shelf(self, walk: Walk, method: Method) -> Path | None:
@@ -168,7 +168,7 @@ class _Graph:
         told = self._told(
             character=seed, trials=count, repeats=trials.repeats, horizon=trials.horizon
         )
-        weight = (count + 2 * trials.repeats) * trials.horizon / 5
+        weight = 30 + (count + 2 * trials.repeats) * trials.horizon / 5
         self._add(Cell(name, "trials", dict(needs), told, self._given(), weight))
 
     def _diagnosis(self, seed: int) -> None:
@@ -177,7 +177,7 @@ class _Graph:
         if plan.rollouts and walked:
             needs["rollouts"] = f"trials-r{seed}-{walked[0].direction}-{Method.PUP}"
         told = self._told(**asdict(plan))
-        self._add(Cell(f"diagnosis-r{seed}", "diagnosis", needs, told, self._given(), 1e3))
+        self._add(Cell(f"diagnosis-r{seed}", "diagnosis", needs, told, self._given(), 300.0))
 
     def _corrected(self, walk: Walk) -> None:
         """The fleet's policy trained on for each robot, in its corrected simulator and its own."""
@@ -188,7 +188,8 @@ class _Graph:
                 # NN-PD beside the effects: the same parameters as the policy that is trained on.
                 told = self._fitted(replace(self.plan.presysid, compare=False))
                 needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
-                self._add(Cell(refit, "presysid", needs, told, self._given(), 1e3))
+                weight = self._cells[f"presysid-r{seed}"].weight
+                self._add(Cell(refit, "presysid", needs, told, self._given(), weight))
             own = {"bounds": f"presysid-r{seed}"}
             corrected = {"bounds": refit, "robot": f"diagnosis-r{seed}"}
             ways = {"corrected": corrected} | ({"own": own} if self.plan.control else {})
@@ -198,7 +199,7 @@ class _Graph:
     def _further(self, walk: Walk, seed: int, way: str, needs: Mapping[str, str]) -> None:
         train, last = self.plan.train, f"r{seed}-{walk.direction}-{way}"
         told = self._told(method=Method.PUP, direction=walk.direction, training=train.further)
-        weight = training(train.further).steps / 5000
+        weight = 20 + training(train.further).steps / 5000
         policy = f"policy-{last}"
         self._add(Cell(policy, "policy", dict(needs), told, self._given(), weight))
         walked = {name: cell for name, cell in needs.items() if name != "start"}
