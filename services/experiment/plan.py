@@ -212,7 +212,7 @@ def small() -> Plan:
     return Plan(
         seeds=(1000, 1001),
         walks=(Walk(Direction.FORWARD, ALL, 2),),
-        record=Recorded(("step:0.3", "standup:2")),
+        record=Recorded(("step:0.3", "standup:2"), fitted=("step",)),
         presysid=replace(fits, compare=False),
         fleet=fits,
         train=Train(least, least),
