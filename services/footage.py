@@ -198,7 +198,9 @@ def _rendered(scene: _Scene) -> Frames:
         camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
         axis = scene.footage.axis
         camera.azimuth = float(np.degrees(np.arctan2(axis[1], axis[0]))) + 120
-        camera.elevation, camera.distance = -15.0, 1.3
+        camera.elevation, camera.distance = -12.0, 0.95
+        lamp = scene.model.vis.headlight  # robots are dark, and models come without lights
+        lamp.ambient[:], lamp.diffuse[:] = 0.5, 0.7
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         for frame in range(len(scene.footage.time)):
             data = scene.show(frame)
