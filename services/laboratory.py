@@ -29,8 +29,9 @@ from services.gateway.keys import KeyRing, Role, Tokens
 from workers import reaper
 
 AGENT, OPERATOR = "virtual", "run"
-RATE = 33.0
-"""Of the control loop, Hz (paper)."""
+RATE = 1 / 0.031
+"""Of the control loop, Hz: within the paper's 25 to 33, and of whole milliseconds, in which
+the virtual robot's time passes."""
 PATIENCE = 120.0
 """For a process to be ready, s; the machine may be busy."""
 GRACE = 15.0
