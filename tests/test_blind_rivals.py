@@ -226,7 +226,7 @@ def test_refuses_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture
         (("--robots", "darwin_op2"), "no case of darwin_op2"),
         (("--out", str(tmp_path / "table.md")), "needs a file for JSON"),
     ):
-        assert blind_rivals.main(arguments(folder, *more)) == 2
+        assert blind_rivals.main(arguments(folder, *more, "--rivals", "residual_rms")) == 2
         told = capsys.readouterr().err
         assert said in told and "Traceback" not in told
 
