@@ -33,7 +33,7 @@ from workers.rollouts import Sampler, Sampling, spaces
 
 SHAPE = PolicyShape.of(Method.PUP, 2, 2, 2)
 SAMPLING = Sampling(ToyTask, simulations=32, steps=32, seed=0, threads=1)
-LEARNING = Learning(epochs=4, minibatch=256, iterations=30)
+LEARNING = Learning(epochs=4, minibatch=256, rate=1e-3, iterations=30)
 TOY = Setup(SHAPE, SAMPLING, LEARNING)
 ROBOT = RobotDescription.load("darwin_op2")
 
