@@ -4,7 +4,6 @@ A case is diagnosed by one process on one core: inside, a small case does not pa
 written of a case is what `pup diagnose` writes but the report; `run.json` tells with which engine.
 """
 
-import traceback
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,17 +12,14 @@ from typing import Any
 
 from pup.blind.seal import COMMITMENT, read_set
 from pup.errors import InputError
-from pup.files import write_json
 from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription, built_in_robots
 from services.blind_journal import JOURNAL, Journal
 from services.diagnosis import DIAGNOSIS, alone, run_diagnosis
+from services.failures import ERROR, caught, lost, mended, named
 from services.places import Each
 
-ERROR = "error.json"
 SEED = 0
-SHOWN = 5
-"""Failed cases that a message names."""
 
 Tell = Callable[..., None]
 """See `progress.counted`."""
@@ -129,10 +125,8 @@ def diagnose_case(order: Order) -> Outcome:
             robot, recordings, order.out, alone(1), lambda stage, share: None, SEED, report=False
         )
     except Exception as error:  # whatever it is, the other cases go on
-        message = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        _write_error(order, message, traceback.format_exc())
-        return Outcome(error=message)
-    (order.out / ERROR).unlink(missing_ok=True)
+        return Outcome(error=caught(order.out, error))
+    mended(order.out)
     return Outcome(told["verdict"], told["seconds"])
 
 
@@ -153,14 +147,7 @@ def _settled(order: Order, outcome: Any) -> Outcome:
     """An outcome; a case whose process was lost has none, and gets its error file here."""
     if isinstance(outcome, Outcome):
         return outcome
-    lines = str(outcome).strip().splitlines() or [""]
-    message = f"{type(outcome).__name__}: {lines[0]}"
-    _write_error(order, message, str(outcome))
-    return Outcome(error=message)
-
-
-def _write_error(order: Order, message: str, details: str) -> None:
-    write_json(order.out / ERROR, {"schema": 1, "error": message, "details": details.splitlines()})
+    return Outcome(error=lost(order.out, outcome))
 
 
 def _note(order: Order, told: Outcome, failed: dict[str, str]) -> str:
@@ -169,9 +156,7 @@ def _note(order: Order, told: Outcome, failed: dict[str, str]) -> str:
 
 
 def _complaint(failed: dict[str, str], cases: int, folder: Path) -> str:
-    named = [f"{name} ({error[:160]})" for name, error in sorted(failed.items())]
-    more = [f"and {len(named) - SHOWN} more in {JOURNAL}"] if len(named) > SHOWN else []
     return (
         f"{folder}: {len(failed)} of {cases} cases failed, see their {ERROR}; the same command "
-        f"tries them again: {', '.join(named[:SHOWN] + more)}"
+        f"tries them again: {named(failed, f' in {JOURNAL}')}"
     )

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis, diagnose
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.replays import Bench, Replays, Runner, threads
 from pup.diagnosis.report import write_report
 from pup.diagnosis.residuals import Measured
@@ -147,19 +148,30 @@ def _clear(kept: Path) -> None:
 def _write_corrected(found: Diagnosis, out: Path) -> str:
     """Write the robot as it was found to be; what is nominal stays as it was fitted."""
     fit = found.model.fit if found.model else found.nominal.fit
-    values = {n: v for n, v in fit.values.items() if "@" not in n}
+    write_fit(found.robot, fit, out / CORRECTED, "Corrected by `pup diagnose`.")
+    return str(out / CORRECTED)
+
+
+def write_fit(robot: RobotDescription, fit: Fit, folder: Path, notes: str = "") -> None:
+    """Write a robot with the nominal parameters and the effects of a fit beside its own terms.
+
+    Args:
+      robot: that was fitted.
+      fit: with PD servos.
+      folder: where to write.
+      notes: comment at the head of `robot.toml`.
+    """
+    nominal: dict[str, float] = {}
     terms: dict[tuple[str, Kind, str], dict[str, float]] = {}
     for name, value in fit.values.items():
         told = split_column(name)
-        if told is not None:
+        if told is None:
+            nominal[name] = value
+        else:
             effect, quantity, place = told
             terms.setdefault((effect, place.kind, place.name), {})[quantity] = value
-    known = list(found.robot.terms) + [
-        TermSpec(effect, kind, name, given) for (effect, kind, name), given in terms.items()
-    ]
-    folder = out / CORRECTED
-    write_corrected(found.robot, folder, values, known, "Corrected by `pup diagnose`.", "pd")
-    return str(folder)
+    specs = [TermSpec(*key, given) for key, given in terms.items()]
+    write_corrected(robot, folder, nominal, [*robot.terms, *specs], notes)
 
 
 def _provenance(

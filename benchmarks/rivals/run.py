@@ -1,7 +1,6 @@
 """Rivals run on the cases of a set: a verdict for each, in the form of `diagnosis.json`."""
 
 import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -15,15 +14,13 @@ from benchmarks.rivals.refits import exhaustive, ladder
 from benchmarks.rivals.rms import rms
 from benchmarks.rivals.sparse import sparse
 from pup.blind.score import Replayed
-from pup.diagnosis.fitting import Fit
 from pup.files import write_json
-from pup.physics.terms import Kind, split_column
 from pup.recording import Recording, load_recordings
-from pup.robot import RobotDescription, TermSpec
-from pup.robot_writer import write_corrected
+from pup.robot import RobotDescription
 from services.blind_oracle import replayed
-from services.blind_run import ERROR, Order
-from services.diagnosis import CORRECTED, DIAGNOSIS
+from services.blind_run import Order
+from services.diagnosis import CORRECTED, DIAGNOSIS, write_fit
+from services.failures import caught, mended
 
 Rival = Callable[[Case], Verdict | tuple[Verdict, Network]]
 
@@ -97,9 +94,7 @@ def run_case(order: Order, rivals: Sequence[str], folder: Path) -> Iterator[tupl
             try:
                 yield rival, _judged(case, rival, shared, out)
             except Exception as error:  # whatever it is, the others go on
-                lines = traceback.format_exc().splitlines()
-                write_json(out / ERROR, {"schema": 1, "error": str(error), "details": lines})
-                yield rival, f"failed, {type(error).__name__}: {error}"
+                yield rival, f"failed, {caught(out, error)}"
 
 
 def _judged(case: Case, rival: str, shared: Cost, out: Path) -> str:
@@ -109,27 +104,14 @@ def _judged(case: Case, rival: str, shared: Cost, out: Path) -> str:
     cost = shared + Cost.now(case).since(begin)
     verdict, network = told if isinstance(told, tuple) else (told, None)
     if verdict.fit is not None:
-        _write_robot(case, verdict.fit, out / CORRECTED)
+        write_fit(case.robot, verdict.fit, out / CORRECTED)
     if network is not None:
         network.save(out / CORRECTED / FILE)
     document = case.document(verdict, cost.simulations, str(out / CORRECTED))
     document |= {"seconds": cost.seconds, "processor_seconds": cost.processor}
     write_json(out / DIAGNOSIS, document)
-    (out / ERROR).unlink(missing_ok=True)
+    mended(out)
     return f"{document['verdict']} {', '.join(n.effect for n in verdict.named[:3])}".strip()
-
-
-def _write_robot(case: Case, fit: Fit, folder: Path) -> None:
-    """Write a rival's model as a robot."""
-    terms: dict[tuple[str, Kind, str], dict[str, float]] = {}
-    for name, value in fit.values.items():
-        told = split_column(name)
-        if told is not None:
-            effect, quantity, place = told
-            terms.setdefault((effect, place.kind, place.name), {})[quantity] = value
-    values = {name: value for name, value in fit.values.items() if "@" not in name}
-    specs = [TermSpec(*key, given) for key, given in terms.items()]
-    write_corrected(case.robot, folder, values, [*case.robot.terms, *specs])
 
 
 def replay(diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:

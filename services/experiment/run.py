@@ -9,7 +9,6 @@ import json
 import platform
 import shutil
 import time
-import traceback
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
 from services.experiment.cells import Cell, chosen
 from services.experiment.work import KINDS, LEFT, RESULT, Task
+from services.failures import ERROR, SHOWN, caught, lost, mended, named
 from services.places import Each
 from services.progress import Told
 from services.provenance import engine, now
@@ -28,9 +28,7 @@ from services.stages import Journal, Stage
 CELLS, AGAIN = "cells", "again"
 FILES = "files"
 """Folder of a cell's files, within its own."""
-MADE, ERROR = "made.json", "error.json"
-SHOWN = 5
-"""Failed cells that a message names."""
+MADE = "made.json"
 
 
 @dataclass(frozen=True)
@@ -159,21 +157,17 @@ def work_on(order: Order) -> Outcome:
         order.folder.mkdir(parents=True, exist_ok=True)
         Journal(order.folder).once(order.stage())
     except Exception as error:  # whatever it is, other cells go on
-        message = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        _write_error(order, message, traceback.format_exc())
-        return Outcome(error=message)
-    (order.folder / ERROR).unlink(missing_ok=True)
+        return Outcome(error=caught(order.folder, error))
+    mended(order.folder)
     return Outcome(time.monotonic() - begin)
 
 
 def complaint(failed: Mapping[str, str], out: Path) -> str:
     """Which cells failed, in a line."""
     own = {name: why for name, why in failed.items() if not why.startswith("needs ")}
-    named = [f"{name} ({why[:160]})" for name, why in sorted(own.items())]
-    more = [f"and {len(named) - SHOWN} more"] if len(named) > SHOWN else []
     return (
         f"{out}: {len(own)} cells failed and {len(failed) - len(own)} need them, see "
-        f"{CELLS}/*/{ERROR}; the same command tries them again: {', '.join(named[:SHOWN] + more)}"
+        f"{CELLS}/*/{ERROR}; the same command tries them again: {named(own)}"
     )
 
 
@@ -226,12 +220,4 @@ def _settled(order: Order, outcome: Any) -> Outcome:
     """An outcome; a cell whose process was lost has none, and gets its error file here."""
     if isinstance(outcome, Outcome):
         return outcome
-    lines = str(outcome).strip().splitlines() or [""]
-    message = f"{type(outcome).__name__}: {lines[0]}"
-    _write_error(order, message, str(outcome))
-    return Outcome(error=message)
-
-
-def _write_error(order: Order, message: str, details: str) -> None:
-    told = {"schema": 1, "error": message, "details": details.splitlines()}
-    write_json(order.folder / ERROR, told)
+    return Outcome(error=lost(order.folder, outcome))
