@@ -22,7 +22,7 @@ from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
 from pup.sysid.result import Bounds, SubsetFit
-from pup.sysid.uncertainty import confidence_at, observable
+from pup.sysid.uncertainty import observable, spread_at
 from workers.fits import Fit, Runner, Status
 
 Array = NDArray[np.float64]
@@ -216,10 +216,11 @@ class _Job:
         space = bounded.free_space
         values = np.array([s.values for s in subsets])
         at = space.normalise(space.nominal)
-        known = confidence_at(bounded, at)
+        spread = spread_at(bounded, at)
+        known, together = spread.confidence(0.9), spread.together(0.95)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
         # A few subsets, all pulled to the nominal point, may differ by less than the data allow.
-        lower, upper = np.minimum(lower, known.lower), np.maximum(upper, known.upper)
+        lower, upper = np.minimum(lower, together.lower), np.maximum(upper, together.upper)
         actuator = self.options.actuator
         main, nominal = full[actuator], fitted["nominal", actuator]
         phi = [n for n in bounded.space.names if n in NETWORK_NAMES]

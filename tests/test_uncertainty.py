@@ -4,7 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pup.sysid.uncertainty import Told, information
+from pup.physics.parameters import ParameterSpace
+from pup.sysid.ripples import Shares, surface
+from pup.sysid.slopes import Slopes, Told, slopes
+from pup.sysid.uncertainty import over_ripples
 
 Array = NDArray[np.float64]
 TICKS = (slice(0, 60), slice(60, 100))
@@ -35,7 +38,7 @@ def test_intervals_are_as_wide_as_the_estimates_scatter() -> None:
     jacobian[300:] *= 0.1
     found = np.array([minimum(SPREAD * rng.normal(size=500), jacobian) for _ in range(150)])
     error = SPREAD * rng.normal(size=500)
-    expected = np.sqrt(np.diag(np.linalg.inv(information(told(error, jacobian), []))))
+    expected = np.sqrt(np.diag(np.linalg.inv(slopes(told(error, jacobian), []).information)))
     np.testing.assert_allclose(found.std(axis=0), expected, rtol=0.2)
 
 
@@ -47,9 +50,51 @@ def test_a_start_that_is_read_with_noise_widens_them() -> None:
     first = np.repeat(np.isin(np.arange(100), np.arange(60)), 3)
     start = 0.02 * np.concatenate([first, np.zeros(200)])
     alone, together = (
-        1 / float(information(told(error, jacobian), given)[0, 0]) for given in ([], [start])
+        1 / float(slopes(told(error, jacobian), given).information[0, 0]) for given in ([], [start])
     )
     # A norm of d numbers of spread s pulls with its weight times E|e| / (d s^2).
     pull = WEIGHT / SPREAD * np.repeat([np.sqrt(8 / np.pi) / 3, np.sqrt(np.pi / 2) / 2], [300, 200])
     share = float((pull[:300] * first).sum() / pull.sum())
     np.testing.assert_allclose(together - alone, (0.02 * share) ** 2, rtol=0.25)
+
+
+SHARP = np.array([[40.0, 10.0, 0.0], [10.0, 20.0, 0.0], [0.0, 0.0, 0.0]])
+"""Curvature of a loss that its third parameter does nothing to."""
+NOTHING = Slopes(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)))
+
+
+def rippled(rng: np.random.Generator, recordings: int = 10) -> tuple[Shares, Array]:
+    """Losses of recordings, and the best of 300 points, where a fit would end.
+
+    Each recording has its own minimum, scattered about the middle, and ripples of a hundredth.
+    """
+    minima = 0.5 + 0.02 * rng.normal(size=(recordings, 3))
+    wave = rng.normal(size=(recordings, 2)) * 400
+    phase = rng.uniform(0, 2 * np.pi, recordings)
+
+    def shares(units: Array) -> Array:
+        off = units[:, None] - minima
+        ripple = 0.01 * np.sin((units[:, None, :2] * wave).sum(axis=2) + phase)
+        return np.asarray(1 + np.einsum("nri,ij,nrj->nr", off, SHARP, off) / 2 + ripple)
+
+    tried = 0.5 + 0.05 * rng.normal(size=(300, 3))
+    return shares, tried[np.argmin(shares(tried).mean(axis=1))]
+
+
+def test_ripples_hide_no_parameter_and_sharpen_none() -> None:
+    """Nine intervals in ten hold the truth, and what the loss does not depend on stays unknown."""
+    rng = np.random.default_rng(2)
+    space = ParameterSpace(("a", "b", "c"), ("1",) * 3, np.full(3, 0.5), np.zeros(3), np.ones(3))
+    inside, wide = [], []
+    for _ in range(60):
+        shares, unit = rippled(rng)
+        start = np.diag([1e-6, 1e-6, 1 / 12])  # a ripple's slopes claim a thousandth
+        ground = surface(shares, unit, start, NOTHING.curvature, 0.03)
+        told = over_ripples(space, unit, NOTHING, ground).confidence(0.9)
+        inside.append((told.lower <= 0.5) & (told.upper >= 0.5))
+        wide.append(told.upper - told.lower)
+    held, width = np.mean(inside, axis=0), np.median(wide, axis=0)
+    assert (held[:2] > 0.8).all()
+    assert (held[:2] < 0.99).all()
+    assert (width[:2] < 0.08).all()
+    assert width[2] > 0.85

@@ -64,7 +64,7 @@ class Confidence:
     """Intervals and correlations of a fit's parameters, in the units of their space.
 
     Attributes:
-      lower: lower ends of the 90 % intervals, clipped to the search range.
+      lower: lower ends of the intervals, clipped to the search range.
       upper: upper ends.
       correlation: shape (n_parameters, n_parameters).
       identified: whether the data narrow each parameter to less than IDENTIFIED_SHARE of its range.
@@ -136,16 +136,24 @@ def least_squares(
     return LeastSquares(at, cost, converged, replays + len(at), covariance, noise)
 
 
-def confidence(space: ParameterSpace, best: Array, covariance: Array) -> Confidence:
-    """90 % intervals and correlations of a fit, assuming the model right.
+def confidence(
+    space: ParameterSpace,
+    best: Array,
+    covariance: Array,
+    freedom: Array | float = np.inf,
+    level: float = 0.9,
+) -> Confidence:
+    """Intervals and correlations of a fit, assuming the model right.
 
     Args:
       space: the parameters.
       best: where the fit ended on the unit cube, shape (n_parameters,).
       covariance: there, shape (n_parameters, n_parameters).
+      freedom: degrees of freedom that each variance was estimated with, shape (n_parameters,).
+      level: how often an interval is to hold the truth.
     """
     sd = np.sqrt(np.diag(covariance))
-    reach = stats.norm.ppf(0.95) * sd
+    reach = stats.t.ppf((1 + level) / 2, freedom) * sd
     correlation = covariance / np.maximum(np.outer(sd, sd), 1e-300)
     return Confidence(
         space.denormalise(np.clip(best - reach, 0, 1)),

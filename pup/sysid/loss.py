@@ -103,6 +103,16 @@ class ReplayLoss:
             loss = loss + FEET_WEIGHT * _mean(terms.feet[:, standing])
         return np.asarray(loss)
 
+    def shares(self, terms: Terms) -> Array:
+        """What each recording adds to equation 1, which is their mean.
+
+        Shape (n_candidates, n_recordings).
+        """
+        count = len(self.recordings)
+        tilt = TILT_WEIGHT * count / max(int(self.tilting.sum()), 1)
+        feet = FEET_WEIGHT * count / max(int(self.standing.sum()), 1)
+        return np.asarray(terms.position + tilt * terms.tilt + feet * terms.feet)
+
     def omitted(self) -> list[str]:
         """What the recordings lack of equation 1, in words."""
         lines = []

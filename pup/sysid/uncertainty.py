@@ -1,19 +1,16 @@
 """What the recordings say about each parameter around a fitted point."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pup.physics.rest import ticks_at_rest
-from pup.recording import Recording
-from pup.sysid.excitation import joint_units
-from pup.sysid.gauss_newton import Confidence, confidence, differences
-from pup.sysid.polish import STEP
+from pup.physics.parameters import ParameterSpace
+from pup.sysid.gauss_newton import Confidence, confidence
 from pup.sysid.problem import Problem
+from pup.sysid.ripples import Shares, Surface, surface
+from pup.sysid.slopes import Slopes, slopes, told_at
 
 Array = NDArray[np.float64]
 
@@ -21,10 +18,10 @@ UNIFORM = 12.0
 """Information of a uniform prior on the unit cube: one over its variance."""
 ROUNDING = 1e-6
 """Relative change of the loss that is rounding: a fixed torso's mass reaches solver tolerances."""
-READING, TILT_READING = 0.0015, 0.002
-"""Noise of a reading: a step of a 12-bit encoder, and an IMU's, rad."""
-RIDGE = 1e-12
-"""Of the slopes' variance, for parameters that nothing depends on."""
+RISE = 0.03
+"""Share by which equation 1 rises on average where a surface is fitted to it."""
+FARTHEST = 2.0
+"""Standard deviations of a surface's draws that its minimum may lie away."""
 UNSEEN = 0.9
 """Share of the prior's spread left, above which the interval is the whole search range."""
 
@@ -49,144 +46,104 @@ def observable(problem: Problem, unit: Array) -> tuple[str, ...]:
     return tuple(n for n, seen in zip(problem.free, moved, strict=True) if seen)
 
 
-def confidence_at(problem: Problem, unit: Array) -> Confidence:
-    """90 % intervals and correlations at a fitted point of equation 1.
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Where the truth may be, on the unit cube.
 
-    Residuals of a replay are far from independent, so the information is deflated by the
-    (1 + r)/(1 - r) of the lag-one autocorrelation r of the joints' errors; and each replay starts
-    from readings, whose noise goes with it all the way. The values of parameters that are not free
-    are taken as known. Parameters that the recordings cannot see get their whole search range.
+    Attributes:
+      space: the parameters.
+      centre: shape (n_parameters,).
+      covariance: shape (n_parameters, n_parameters).
+      freedom: degrees of freedom that each variance was estimated with, shape (n_parameters,).
+    """
+
+    space: ParameterSpace
+    centre: Array
+    covariance: Array
+    freedom: Array
+
+    def confidence(self, level: float) -> Confidence:
+        """Intervals that hold each parameter so often; what is not seen gets its whole range."""
+        told = confidence(self.space, self.centre, self.covariance, self.freedom, level)
+        unseen = np.sqrt(UNIFORM * np.diag(self.covariance)) > UNSEEN
+        return replace(
+            told,
+            lower=np.where(unseen, self.space.lower, told.lower),
+            upper=np.where(unseen, self.space.upper, told.upper),
+        )
+
+    def together(self, level: float) -> Confidence:
+        """Intervals that hold all parameters at once so often (Bonferroni)."""
+        return self.confidence(1 - (1 - level) / len(self.space))
+
+
+def spread_at(problem: Problem, unit: Array) -> Spread:
+    """What the recordings tell around a fitted point of equation 1.
+
+    Where the robot hangs, from the slopes at the point. With contact those are a ripple's, and a
+    surface through replays around the point tells instead (see `ripples`). Values of parameters
+    that are not free are taken as known.
 
     Args:
       problem: what was fitted.
       unit: the fitted point on the unit cube, shape (n_free,).
     """
-
-    def weighted(candidates: Array) -> Array:
-        return problem.errors(candidates)[0]
-
-    fitted = problem.replay(unit[None])
-    error, blocks = problem.loss.weighted_errors(fitted)
-    jacobian = differences(weighted, unit, error[0], STEP)
-    r = _lag_one(problem.loss.errors(fitted)[0][0], problem)
-    seen = Told(error[0], jacobian, blocks, problem.loss.ticks, (1 + r) / (1 - r))
-    starts = _starts(problem, unit, error[0])
+    on_ground = np.array([r.support == "ground" for r in problem.recordings])
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads
-        known = information(seen, starts)
-    covariance = np.asarray(np.linalg.inv(known + UNIFORM * np.eye(len(unit))), dtype=np.float64)
-    space = problem.free_space
-    told = confidence(space, unit, covariance)
-    unseen = np.sqrt(UNIFORM * np.diag(covariance)) > UNSEEN
-    return replace(
-        told,
-        lower=np.where(unseen, space.lower, told.lower),
-        upper=np.where(unseen, space.upper, told.upper),
-    )
+        told, starts = told_at(problem, unit)
+        information = slopes(told, starts).information
+        covariance = np.asarray(np.linalg.inv(information + UNIFORM * np.eye(len(unit))))
+        if not on_ground.any():
+            return Spread(problem.free_space, unit, covariance, np.full(len(unit), np.inf))
+        hanging = slopes(told.of(~on_ground), starts)
+        rise = RISE * float(problem.losses(unit[None])[0])
+        shares = _shares(problem, on_ground)
+        ground = surface(shares, unit, covariance, hanging.curvature, rise)
+        return over_ripples(problem.free_space, unit, hanging, ground)
 
 
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What recordings tell at a minimum of a sum of norms.
+def _shares(problem: Problem, chosen: NDArray[np.bool_]) -> Shares:
+    """What each of some recordings adds to equation 1 over all of them."""
+    part = problem.of(np.flatnonzero(chosen).tolist())
 
-    Attributes:
-      error: weighted, shape (n_errors,); zero where nothing was measured.
-      jacobian: its slopes, shape (n_errors, n_parameters).
-      blocks: where each norm's errors begin, tick after tick for each kind of error.
-      ticks: of each recording.
-      memory: by how much the variance of a sum of errors exceeds that of independent ones.
-    """
+    def shares(units: Array) -> Array:
+        terms = part.loss.terms(part.replay(units))
+        # The mean of positions is over all recordings, those of tilt and feet over these anyway.
+        return np.asarray(part.loss.shares(terms) + (chosen.mean() - 1) * terms.position)
 
-    error: Array
-    jacobian: Array
-    blocks: NDArray[np.int64]
-    ticks: Sequence[slice]
-    memory: float
-
-    def rows(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values of the norms, for each of their errors."""
-        return np.repeat(values, np.diff([*self.blocks, len(self.error)]))
-
-    def recordings(self) -> NDArray[np.int64]:
-        """Which recording each error is of."""
-        of_tick = np.repeat(np.arange(len(self.ticks)), [t.stop - t.start for t in self.ticks])
-        return self.rows(np.resize(of_tick, len(self.blocks)))
+    return shares
 
 
-def information(told: Told, starts: Sequence[Array]) -> Array:
-    """What the point that minimises a sum of norms tells of its parameters: inverse covariance.
-
-    Norms weigh what is noisy by its noise, not by its variance, and equation 1 weighs tilt by ten
-    besides: its minimum is not where least squares would put it, and lies further from the truth.
-    With the norms' mean curvature A and the variance B of their slopes it is A B^-1 A (sandwich).
-    For errors of d alike Gaussian numbers, A has E|e| / E|e|^2 of the squared sensitivities
-    (Stein's lemma) and B has 1/d.
+def over_ripples(space: ParameterSpace, unit: Array, hanging: Slopes, ground: Surface) -> Spread:
+    """Where the minimum of equation 1 is, and how it would scatter with other recordings.
 
     Args:
-      told: what the recordings tell.
-      starts: what noise in a start's readings does to the errors, one standard deviation of one
-        reading of all recordings each, shape (n_errors,).
+      space: the parameters.
+      unit: where the slopes and the surface were taken, on the unit cube, shape (k,).
+      hanging: of the recordings in the air.
+      ground: of those with contact.
     """
-    lengths = np.sqrt(np.add.reduceat(told.error**2, told.blocks))
-    counted = np.add.reduceat((told.error != 0).astype(float), told.blocks)
-    kind = np.arange(len(told.blocks)) // told.ticks[-1].stop
-    curvature, slope = np.zeros((2, len(told.blocks)))
-    for one in np.unique(kind):
-        own = (counted > 0) & (kind == one)
-        if own.any():
-            curvature[own] = lengths[own].mean() / np.mean(lengths[own] ** 2)
-    slope[counted > 0] = told.memory / counted[counted > 0]
-    curved = told.rows(curvature)[:, None] * told.jacobian
-    a, b = told.jacobian.T @ curved, told.jacobian.T @ (told.rows(slope)[:, None] * told.jacobian)
-    recording = told.recordings()
-    for start in starts:
-        moved = np.zeros((len(told.ticks), len(a)))
-        np.add.at(moved, recording, curved * start[:, None])
-        b += moved.T @ moved
-    b += RIDGE * max(np.trace(b), RIDGE) * np.eye(len(b))
-    return np.asarray(a @ np.linalg.solve(b, a))
-
-
-def _starts(problem: Problem, unit: Array, error: Array) -> list[Array]:
-    """How the errors change with each reading of a start, by one standard deviation of its noise.
-
-    Recordings do not meet: all of them start otherwise at once.
-    """
-    robot = problem.robot
-    noise = {
-        name: READING * u for name, u in zip(robot.joint_names, joint_units(robot), strict=True)
-    }
-    if problem.loss.tilting.any():
-        noise |= {name: TILT_READING for name in ("imu/roll", "imu/pitch")}
-    told = []
-    for name, sd in noise.items():
-        moved = tuple(_moved(recording, name, sd) for recording in problem.recordings)
-        changed = replace(problem, recordings=moved).errors(unit[None])[0][0]
-        told.append(changed - error)
-    return told
-
-
-def _moved(recording: Recording, name: str, by: float) -> Recording:
-    """A recording with the reading of a joint or of the IMU moved that its replay starts from."""
-    ticks = ticks_at_rest(recording)
-    by /= np.sqrt(ticks)
-    if name in recording.joints:
-        position = recording.position.copy()
-        position[:ticks, recording.joints.index(name)] += by
-        return replace(recording, position=position)
-    if name not in recording.extras:
-        return recording
-    values = recording.extras[name].copy()
-    values[:ticks] += by
-    return replace(recording, extras={**recording.extras, name: values})
-
-
-def _lag_one(error: Array, problem: Problem) -> float:
-    """Lag-one autocorrelation of the joints' errors within recordings, at most 1 - 2/n_ticks."""
-    products, squares = 0.0, 0.0
-    for part in problem.loss.ticks:
-        now, before = error[part][1:], error[part][:-1]
-        both = (now != 0) & (before != 0)  # an error of exactly zero was not measured
-        products += float((now * before)[both].sum())
-        squares += float(((now**2 + before**2) / 2)[both].sum())
-    longest = max(part.stop - part.start for part in problem.loss.ticks)
-    return float(np.clip(products / max(squares, 1e-300), 0.0, max(0.0, 1 - 2 / longest)))
+    count = len(ground.slopes)
+    mean = ground.slopes.mean(axis=0)
+    off = (ground.slopes - mean) / np.sqrt(count * max(count - 1, 1))
+    inverse = np.linalg.inv(hanging.curvature + ground.at_least)
+    step = -inverse @ (hanging.gradient + mean)
+    far = float(np.sqrt(step @ np.linalg.solve(ground.draws, step)))
+    both = Slopes(
+        hanging.gradient + mean,
+        hanging.curvature + ground.curvature,
+        hanging.scatter + ground.slope_error + off.T @ off,
+    )
+    # After Welch and Satterthwaite: only the scatter over recordings is an estimate, and a normal
+    # variable's fourth moment is three times its variance's square.
+    squares = (off @ inverse) ** 2
+    speaking = 3 * squares.sum(axis=0) ** 2 / np.maximum((squares**2).sum(axis=0), 1e-300) - 1
+    speaking = np.clip(speaking, 1.0, max(count - 1, 1))
+    variance = np.diag(inverse @ both.scatter @ inverse)
+    freedom = speaking * (variance / np.maximum(squares.sum(axis=0), 1e-300)) ** 2
+    return Spread(
+        space,
+        unit + step * min(1.0, FARTHEST / max(far, 1e-300)),
+        np.asarray(np.linalg.inv(both.information + UNIFORM * np.eye(len(unit)))),
+        freedom,
+    )
