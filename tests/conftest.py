@@ -2,8 +2,9 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from refusals import Place
@@ -54,3 +55,21 @@ def bench_recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def place(tmp_path: Path, leg_recordings: Path, bench_recordings: Path) -> Place:
     """Where a case of bad input works."""
     return Place(tmp_path, leg_recordings, bench_recordings)
+
+
+@pytest.fixture(scope="module")
+def browser(service: Any) -> Iterator[Any]:
+    """Chromium, started after the module's service: its store is written without a loop around."""
+    import pages
+
+    with pages.chromium() as made:
+        yield made
+
+
+@pytest.fixture
+def open_page(browser: Any, service: Any) -> Iterator[Any]:
+    """Opens pages of the module's service; fails where one writes an error to its console."""
+    import pages
+
+    with pages.opener(browser, service, lambda message: message.type == "error") as opened:
+        yield opened

@@ -24,18 +24,6 @@ def service(tmp_path_factory):
         yield made
 
 
-@pytest.fixture(scope="module")
-def browser(service):  # whose store is written without a loop around it
-    with pages.chromium() as made:
-        yield made
-
-
-@pytest.fixture
-def open_page(browser, service):
-    with pages.opener(browser, service, lambda message: message.type == "error") as opened:
-        yield opened
-
-
 @pytest.mark.parametrize("size", pages.SIZES)
 def test_every_page_fits_and_is_accessible(open_page, size):
     page = open_page(viewport=pages.SIZES[size])

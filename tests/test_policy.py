@@ -1,24 +1,15 @@
-"""Policies: their networks, symmetry, losses, and the bundle a robot runs."""
-
-import json
-import subprocess
-import sys
-from dataclasses import replace
-from pathlib import Path
+"""Policies: their networks, symmetry and losses."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pup.errors import InputError
-from pup.policy.bundle import NumpyPolicy, PolicyCard, read_bundle, write_bundle
-from pup.policy.mirror import MirrorMap
-from pup.policy.rebase import for_bounds
-from pup.policy.shape import Method, PolicyShape
-from pup.robot import RobotDescription
+from pup.policy.shape import Method
 
 torch = pytest.importorskip("torch")
+
+from policies import MIRROR, OBSERVATION, ROBOT, SIZES, observations, policy_of  # noqa: E402
 
 from pup.policy.losses import (  # noqa: E402
     LossWeights,
@@ -27,75 +18,8 @@ from pup.policy.losses import (  # noqa: E402
     advantages,
     losses,
 )
-from pup.policy.network import Normaliser, ProjectedPolicy, draw, expected  # noqa: E402
-
-ROBOT = RobotDescription.load("darwin_op2")
-OBSERVATION = (
-    *(f"position_before/{name}" for name in ROBOT.joint_names),
-    *(f"position/{name}" for name in ROBOT.joint_names),
-    *("imu/roll", "imu/pitch", "imu_before/roll", "imu_before/pitch"),
-)
-PARAMETERS = ("rho/arm", "rho/knee", "torque_limit", "ground_friction")
-MIRROR = MirrorMap.of(ROBOT, OBSERVATION, PARAMETERS)
-SIZES = len(OBSERVATION), len(PARAMETERS), len(ROBOT.joints)
-
-
-def policy_of(method: Method = Method.PUP, seed: int = 0) -> ProjectedPolicy:
-    """A policy as after some training: with statistics, and actions that are not all alike."""
-    torch.manual_seed(seed)
-    policy = ProjectedPolicy(PolicyShape.of(method, *SIZES))
-    policy.observations.update(torch.randn(500, SIZES[0]) * 0.3 + 0.1)
-    policy.learn_returns(torch.randn(500) * 100 + 300)
-    with torch.no_grad():
-        policy.actor[-1].weight.mul_(200)
-    return policy
-
-
-def card_of(policy: ProjectedPolicy, method: Method = Method.PUP) -> PolicyCard:
-    assert ROBOT.gait is not None
-    count = policy.shape.eta
-    return PolicyCard(
-        robot=ROBOT.name,
-        joints=ROBOT.joint_names,
-        lower=tuple(j.lower for j in ROBOT.joints),
-        upper=tuple(j.upper for j in ROBOT.joints),
-        method=method,
-        direction="forward",
-        shape=policy.shape,
-        observation=OBSERVATION,
-        parameters=PARAMETERS,
-        parameter_lower=(0.5,) * 4,
-        parameter_upper=(1.5,) * 4,
-        eta_lower=(-1.0,) * count,
-        eta_upper=(1.0,) * count,
-        rates=(25.0, 33.0),
-        reach=0.3,
-        smoothing=5,
-        gait=ROBOT.gait,
-        bounds_sha256="0" * 64,
-        robot_digest=ROBOT.digest,
-        provenance={"seed": 0},
-    )
-
-
-def weights_of(policy: ProjectedPolicy) -> dict[str, np.ndarray]:
-    return {name: value.numpy() for name, value in policy.state_dict().items()}
-
-
-@pytest.fixture
-def bundle(tmp_path: Path) -> Path:
-    policy = policy_of()
-    write_bundle(tmp_path / "policy", card_of(policy), weights_of(policy))
-    return tmp_path / "policy"
-
-
-def observations(count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    seen = rng.normal(0.1, 0.4, (count, SIZES[0])).astype(np.float32)
-    return seen, rng.uniform(-0.05, 1.05, (count, SIZES[1]))
-
-
-# --- Networks -------------------------------------------------------------------------------------
+from pup.policy.network import Normaliser, ProjectedPolicy, draw  # noqa: E402
+from pup.policy.shape import PolicyShape  # noqa: E402
 
 
 def test_normaliser_of_parts_is_that_of_the_whole() -> None:
@@ -273,151 +197,3 @@ def test_advantages_by_hand() -> None:
     assert told[1].tolist() == pytest.approx([fall, clock])
     first = 1 + 0.9 * 20 - 10
     assert told[0].tolist() == pytest.approx([first + 0.45 * fall, first + 0.45 * clock])
-
-
-# --- The bundle -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", list(Method))
-def test_numpy_torch_and_onnx_pick_the_same_actions(tmp_path: Path, method: Method) -> None:
-    """On 10,000 observations, all joints."""
-    runtime = pytest.importorskip("onnxruntime")
-    policy = policy_of(method)
-    write_bundle(tmp_path, card_of(policy, method), weights_of(policy))
-    run = NumpyPolicy.load(tmp_path, ROBOT)
-    seen, mu = observations(10_000)
-    eta = run.project(mu)
-    policy.double()
-    with torch.no_grad():
-        told = policy.project(torch.from_numpy(mu))
-        by_torch = expected(policy.logits(torch.from_numpy(seen).double(), told)).numpy()
-    np.testing.assert_allclose(eta, told, atol=1e-12)
-    by_numpy = run.act(seen, eta)
-    session = runtime.InferenceSession(str(tmp_path / "policy.onnx"))
-    fed = {"obs": seen.astype(np.float64), "eta": eta}
-    known = {i.name for i in session.get_inputs()}
-    by_onnx = session.run(["action"], {k: v for k, v in fed.items() if k in known})[0]
-    np.testing.assert_allclose(by_numpy, by_torch, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(by_numpy, by_onnx, rtol=0, atol=1e-12)
-    assert np.ptp(by_numpy, axis=0).min() > 0.5  # no joint stands still
-
-
-@pytest.mark.parametrize("method", list(Method))
-def test_other_bounds_change_the_scale_and_not_the_policy(method: Method) -> None:
-    """The same physical mu gives the same logits and value; the same bounds the same bits."""
-    policy = policy_of(method)
-    card, rng = card_of(policy, method), np.random.default_rng(3)
-    weights = weights_of(policy)
-    own = np.array(card.parameter_lower), np.array(card.parameter_upper)
-    same = for_bounds(card, weights, *own)
-    assert same.keys() == weights.keys()
-    assert all(np.array_equal(same[name], weights[name]) for name in weights)
-    lower, upper = np.array([0.2, 1.0, 0.7, 0.9]), np.array([1.1, 2.0, 0.8, 0.9])
-    width = np.where(upper > lower, upper - lower, 1.0)
-    moved = ProjectedPolicy(policy.shape)
-    moved.load_state_dict(
-        {k: torch.from_numpy(v) for k, v in for_bounds(card, weights, lower, upper).items()}
-    )
-    mu = rng.uniform(0.6, 1.4, (200, 4))
-    seen = torch.from_numpy(observations(200)[0])
-    before = torch.from_numpy(((mu - own[0]) / (own[1] - own[0])).astype(np.float32))
-    after = torch.from_numpy(((mu - lower) / width).astype(np.float32))
-    same_to_the_policy = [lambda p, unit: p(seen, unit), lambda p, unit: p.value(seen, unit)]
-    if method is Method.PUP:  # the eta of UP is mu on the scale of the bounds
-        same_to_the_policy.append(lambda p, unit: p.project(unit))
-    for told in same_to_the_policy:
-        torch.testing.assert_close(told(policy, before), told(moved, after), rtol=1e-4, atol=2e-3)
-
-
-def test_a_bundle_is_read_as_it_was_written(bundle: Path) -> None:
-    """Card and weights."""
-    policy = policy_of()
-    card, weights = read_bundle(bundle, ROBOT)
-    assert card == card_of(policy)
-    for name, value in weights_of(policy).items():
-        np.testing.assert_array_equal(weights[name], value)
-
-
-def test_a_bundle_runs_without_torch(bundle: Path) -> None:
-    """Nor with anything else that a robot's computer lacks."""
-    script = (
-        "import sys, pathlib, numpy as np\n"
-        "from pup.policy.bundle import NumpyPolicy\n"
-        f"p = NumpyPolicy.load(pathlib.Path({str(bundle)!r}))\n"
-        "assert p.act(np.zeros(44), np.zeros(3)).shape == (20,)\n"
-        "print([m for m in ('torch', 'onnx', 'ray', 'mujoco') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout.strip() == "[]", done.stderr
-
-
-def test_targets(bundle: Path) -> None:
-    """Start pose, then the gait moved by the mean of the last actions, within the limits."""
-    run = NumpyPolicy.load(bundle)
-    gait, middle = ROBOT.gait, np.full((1, 20), 5)
-    assert gait is not None
-    lower, upper = np.array(run.card.lower), np.array(run.card.upper)
-    if gait.start is not None:
-        start = np.clip(gait.start, lower, upper)
-        np.testing.assert_allclose(run.targets(0.0, middle), start)
-    time = gait.blend + 1.25 * gait.period
-    still = gait.angles(0.25)
-    np.testing.assert_allclose(run.targets(time, middle), np.clip(still, lower, upper))
-    pushed = np.full((9, 20), 0)
-    pushed[-2:] = 10  # two of the last five
-    expected = np.clip(still + 0.3 * (-0.2), lower, upper)
-    np.testing.assert_allclose(run.targets(time, pushed), expected)
-
-
-def refused(folder: Path, *words: str, robot: RobotDescription | None = None) -> None:
-    with pytest.raises(InputError) as told:
-        read_bundle(folder, robot)
-    for word in words:
-        assert word in str(told.value)
-
-
-def test_changed_bundles_are_refused(bundle: Path) -> None:
-    """Whatever file of it was changed or is missing."""
-    for name in ("weights.npz", "policy.onnx"):
-        content = (bundle / name).read_bytes()
-        (bundle / name).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-        refused(bundle, name, "does not match policy.json")
-        (bundle / name).unlink()
-        refused(bundle, name, "cannot be read")
-        (bundle / name).write_bytes(content)
-    card = json.loads((bundle / "policy.json").read_text())
-    (bundle / "policy.json").write_text(json.dumps(card | {"reach": 1.0}))
-    refused(bundle, "policy.json", "was changed")
-    (bundle / "policy.json").write_text(json.dumps(card | {"schema": 2}))
-    refused(bundle, "policy.json", "schema 1")
-    (bundle / "policy.json").write_text("[]")
-    refused(bundle, "policy.json", "not a policy")
-    (bundle / "policy.json").unlink()
-    refused(bundle, "policy.json", "cannot be read")
-
-
-def test_a_bundle_of_another_robot_is_refused(bundle: Path) -> None:
-    """By its joints too."""
-    refused(bundle, "'darwin_op2'", "'servo_bench'", robot=RobotDescription.load("servo_bench"))
-    refused(bundle, "20 joints", robot=replace(ROBOT, joints=ROBOT.joints[::-1]))
-
-
-def test_targets_are_those_of_the_task(bundle: Path) -> None:
-    """What a robot is sent is what was trained: reference, reach, smoothing and limits."""
-    from pup.locomotion.sampling import ParameterSampler
-    from pup.locomotion.settings import TaskSettings
-    from pup.locomotion.task import WalkingTask
-    from pup.sysid.result import read_bounds
-
-    run, rng = NumpyPolicy.load(bundle), np.random.default_rng(3)
-    sampler = ParameterSampler(read_bounds(ROBOT.identified_path, ROBOT))
-    task = WalkingTask(ROBOT, sampler, TaskSettings(), 2, rng, 1)
-    task.reset()
-    sent: list[np.ndarray] = []
-    move = task._simulations.step
-    task._simulations.step = lambda target, live: sent.append(target[0]) or move(target, live)
-    bins, time = rng.integers(0, 11, (12, 20)), 0.0
-    for i in range(len(bins)):
-        told = task.step(np.stack([bins[i], bins[i]]))
-        np.testing.assert_allclose(sent[-1], run.targets(time, bins[: i + 1]), atol=1e-9)
-        time = float(told.time[0])

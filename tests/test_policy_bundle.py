@@ -1,0 +1,174 @@
+"""The bundle a robot runs."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pup.errors import InputError
+from pup.policy.bundle import NumpyPolicy, read_bundle, write_bundle
+from pup.policy.rebase import for_bounds
+from pup.policy.shape import Method
+from pup.robot import RobotDescription
+
+torch = pytest.importorskip("torch")
+
+from policies import ROBOT, card_of, observations, policy_of, weights_of  # noqa: E402
+
+from pup.policy.network import ProjectedPolicy, expected  # noqa: E402
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    policy = policy_of()
+    write_bundle(tmp_path / "policy", card_of(policy), weights_of(policy))
+    return tmp_path / "policy"
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_numpy_torch_and_onnx_pick_the_same_actions(tmp_path: Path, method: Method) -> None:
+    """On 10,000 observations, all joints."""
+    runtime = pytest.importorskip("onnxruntime")
+    policy = policy_of(method)
+    write_bundle(tmp_path, card_of(policy, method), weights_of(policy))
+    run = NumpyPolicy.load(tmp_path, ROBOT)
+    seen, mu = observations(10_000)
+    eta = run.project(mu)
+    policy.double()
+    with torch.no_grad():
+        told = policy.project(torch.from_numpy(mu))
+        by_torch = expected(policy.logits(torch.from_numpy(seen).double(), told)).numpy()
+    np.testing.assert_allclose(eta, told, atol=1e-12)
+    by_numpy = run.act(seen, eta)
+    session = runtime.InferenceSession(str(tmp_path / "policy.onnx"))
+    fed = {"obs": seen.astype(np.float64), "eta": eta}
+    known = {i.name for i in session.get_inputs()}
+    by_onnx = session.run(["action"], {k: v for k, v in fed.items() if k in known})[0]
+    np.testing.assert_allclose(by_numpy, by_torch, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(by_numpy, by_onnx, rtol=0, atol=1e-12)
+    assert np.ptp(by_numpy, axis=0).min() > 0.5  # no joint stands still
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_other_bounds_change_the_scale_and_not_the_policy(method: Method) -> None:
+    """The same physical mu gives the same logits and value; the same bounds the same bits."""
+    policy = policy_of(method)
+    card, rng = card_of(policy, method), np.random.default_rng(3)
+    weights = weights_of(policy)
+    own = np.array(card.parameter_lower), np.array(card.parameter_upper)
+    same = for_bounds(card, weights, *own)
+    assert same.keys() == weights.keys()
+    assert all(np.array_equal(same[name], weights[name]) for name in weights)
+    lower, upper = np.array([0.2, 1.0, 0.7, 0.9]), np.array([1.1, 2.0, 0.8, 0.9])
+    width = np.where(upper > lower, upper - lower, 1.0)
+    moved = ProjectedPolicy(policy.shape)
+    moved.load_state_dict(
+        {k: torch.from_numpy(v) for k, v in for_bounds(card, weights, lower, upper).items()}
+    )
+    mu = rng.uniform(0.6, 1.4, (200, 4))
+    seen = torch.from_numpy(observations(200)[0])
+    before = torch.from_numpy(((mu - own[0]) / (own[1] - own[0])).astype(np.float32))
+    after = torch.from_numpy(((mu - lower) / width).astype(np.float32))
+    same_to_the_policy = [lambda p, unit: p(seen, unit), lambda p, unit: p.value(seen, unit)]
+    if method is Method.PUP:  # the eta of UP is mu on the scale of the bounds
+        same_to_the_policy.append(lambda p, unit: p.project(unit))
+    for told in same_to_the_policy:
+        torch.testing.assert_close(told(policy, before), told(moved, after), rtol=1e-4, atol=2e-3)
+
+
+def test_a_bundle_is_read_as_it_was_written(bundle: Path) -> None:
+    """Card and weights."""
+    policy = policy_of()
+    card, weights = read_bundle(bundle, ROBOT)
+    assert card == card_of(policy)
+    for name, value in weights_of(policy).items():
+        np.testing.assert_array_equal(weights[name], value)
+
+
+def test_a_bundle_runs_without_torch(bundle: Path) -> None:
+    """Nor with anything else that a robot's computer lacks."""
+    script = (
+        "import sys, pathlib, numpy as np\n"
+        "from pup.policy.bundle import NumpyPolicy\n"
+        f"p = NumpyPolicy.load(pathlib.Path({str(bundle)!r}))\n"
+        "assert p.act(np.zeros(44), np.zeros(3)).shape == (20,)\n"
+        "print([m for m in ('torch', 'onnx', 'ray', 'mujoco') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_targets(bundle: Path) -> None:
+    """Start pose, then the gait moved by the mean of the last actions, within the limits."""
+    run = NumpyPolicy.load(bundle)
+    gait, middle = ROBOT.gait, np.full((1, 20), 5)
+    assert gait is not None
+    lower, upper = np.array(run.card.lower), np.array(run.card.upper)
+    if gait.start is not None:
+        start = np.clip(gait.start, lower, upper)
+        np.testing.assert_allclose(run.targets(0.0, middle), start)
+    time = gait.blend + 1.25 * gait.period
+    still = gait.angles(0.25)
+    np.testing.assert_allclose(run.targets(time, middle), np.clip(still, lower, upper))
+    pushed = np.full((9, 20), 0)
+    pushed[-2:] = 10  # two of the last five
+    expected = np.clip(still + 0.3 * (-0.2), lower, upper)
+    np.testing.assert_allclose(run.targets(time, pushed), expected)
+
+
+def refused(folder: Path, *words: str, robot: RobotDescription | None = None) -> None:
+    with pytest.raises(InputError) as told:
+        read_bundle(folder, robot)
+    for word in words:
+        assert word in str(told.value)
+
+
+def test_changed_bundles_are_refused(bundle: Path) -> None:
+    """Whatever file of it was changed or is missing."""
+    for name in ("weights.npz", "policy.onnx"):
+        content = (bundle / name).read_bytes()
+        (bundle / name).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        refused(bundle, name, "does not match policy.json")
+        (bundle / name).unlink()
+        refused(bundle, name, "cannot be read")
+        (bundle / name).write_bytes(content)
+    card = json.loads((bundle / "policy.json").read_text())
+    (bundle / "policy.json").write_text(json.dumps(card | {"reach": 1.0}))
+    refused(bundle, "policy.json", "was changed")
+    (bundle / "policy.json").write_text(json.dumps(card | {"schema": 2}))
+    refused(bundle, "policy.json", "schema 1")
+    (bundle / "policy.json").write_text("[]")
+    refused(bundle, "policy.json", "not a policy")
+    (bundle / "policy.json").unlink()
+    refused(bundle, "policy.json", "cannot be read")
+
+
+def test_a_bundle_of_another_robot_is_refused(bundle: Path) -> None:
+    """By its joints too."""
+    refused(bundle, "'darwin_op2'", "'servo_bench'", robot=RobotDescription.load("servo_bench"))
+    refused(bundle, "20 joints", robot=replace(ROBOT, joints=ROBOT.joints[::-1]))
+
+
+def test_targets_are_those_of_the_task(bundle: Path) -> None:
+    """What a robot is sent is what was trained: reference, reach, smoothing and limits."""
+    from pup.locomotion.sampling import ParameterSampler
+    from pup.locomotion.settings import TaskSettings
+    from pup.locomotion.task import WalkingTask
+    from pup.sysid.result import read_bounds
+
+    run, rng = NumpyPolicy.load(bundle), np.random.default_rng(3)
+    sampler = ParameterSampler(read_bounds(ROBOT.identified_path, ROBOT))
+    task = WalkingTask(ROBOT, sampler, TaskSettings(), 2, rng, 1)
+    task.reset()
+    sent: list[np.ndarray] = []
+    move = task._simulations.step
+    task._simulations.step = lambda target, live: sent.append(target[0]) or move(target, live)
+    bins, time = rng.integers(0, 11, (12, 20)), 0.0
+    for i in range(len(bins)):
+        told = task.step(np.stack([bins[i], bins[i]]))
+        np.testing.assert_allclose(sent[-1], run.targets(time, bins[: i + 1]), atol=1e-9)
+        time = float(told.time[0])
