@@ -210,15 +210,13 @@ class Overload:
 
     def __init__(self, limits: SafetySettings) -> None:
         self._limits = limits
+        self._heat: Array | None = None
+        self._last: Senses | None = None
         self.reset()
 
     def reset(self) -> None:
         """See Rule: a winding forgets nothing, but it cools while torque is off."""
         self._on = False
-
-    _heat: Array | None = None
-    _last: Senses | None = None
-    _on = False
 
     @property
     def heat(self) -> float:
@@ -239,7 +237,6 @@ class Overload:
         speed = (senses.position - last.position) / max(step, 1e-3)
         duty = np.clip(limits.duty_per_radian * (last.goal - senses.position), -1.0, 1.0)
         current = np.nan_to_num(duty - speed / limits.free_speed)
-        assert self._heat is not None
         share = min(1.0, step / limits.current_time)
         self._heat = self._heat + share * (np.clip(current, -1.5, 1.5) ** 2 - self._heat)
         hot = np.flatnonzero(self._heat > limits.current**2)

@@ -200,14 +200,15 @@ class WalkingTask:
         episodes.over = terminated | truncated
         if not live.all():
             self._restart(np.flatnonzero(~live))
+        walked = (episodes.place - episodes.start)[:, :2]
         return Step(
             observation=self._observation(),
             reward=reward.astype(np.float32),
             terminated=terminated,
             truncated=truncated,
             live=live,
-            distance=(episodes.place - episodes.start)[:, :2] @ self._axis,
-            aside=(episodes.place - episodes.start)[:, :2] @ self._across,
+            distance=walked @ self._axis,
+            aside=walked @ self._across,
             time=episodes.time.copy(),
         )
 

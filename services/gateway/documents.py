@@ -1,5 +1,6 @@
 """What pages read of the documents that jobs write (CONTRACTS.md, sections 4 and 5)."""
 
+from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
@@ -16,7 +17,7 @@ Numbers = Annotated[list[float | None], Field(max_length=500_000)]
 Range = tuple[FiniteFloat, FiniteFloat]
 
 
-class Document(BaseModel):
+class Document(BaseModel, ABC):
     """A document; what is not shown of it is not looked at."""
 
     model_config = ConfigDict(allow_inf_nan=False, frozen=True)
@@ -25,9 +26,9 @@ class Document(BaseModel):
     robot: Text
 
     @property
+    @abstractmethod
     def summary(self) -> str:
         """What it comes to, in a line."""
-        raise NotImplementedError
 
 
 class BoundedParameter(BaseModel):
