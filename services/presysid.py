@@ -216,7 +216,7 @@ class _Job:
         space = bounded.free_space
         values = np.array([s.values for s in subsets])
         at = space.normalise(space.nominal)
-        spread = spread_at(bounded, at)
+        spread = spread_at(bounded, at, self._uncertainty)
         known, together = spread.confidence(0.9), spread.together(0.95)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
         # A few subsets, all pulled to the nominal point, may differ by less than the data allow.
@@ -243,6 +243,9 @@ class _Job:
             omitted=tuple(main.loss.omitted()),
             provenance=self._provenance(time.time() - begin),
         )
+
+    def _uncertainty(self, share: float) -> None:
+        self.progress("uncertainty", [Status("replays", round(100 * share), 100, np.inf)])
 
     def _splits(
         self, values: Array, space: ParameterSpace, subsets: tuple[SubsetFit, ...]

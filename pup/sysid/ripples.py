@@ -50,6 +50,11 @@ class Surface:
     draws: Array
 
 
+def replays(parameters: int) -> int:
+    """How many replays a surface takes."""
+    return sum(ROUNDS) * _coefficients(parameters)
+
+
 def surface(shares: Shares, unit: Array, covariance: Array, hanging: Array, rise: float) -> Surface:
     """Fit the surface around a point.
 
@@ -68,6 +73,10 @@ def surface(shares: Shares, unit: Array, covariance: Array, hanging: Array, rise
     return fitted
 
 
+def _coefficients(parameters: int) -> int:
+    return 1 + parameters + parameters * (parameters + 1) // 2
+
+
 def _bounded(covariance: Array) -> Array:
     """A covariance no wider than WIDEST in any direction."""
     narrow = np.linalg.inv(covariance) + np.eye(len(covariance)) / WIDEST**2
@@ -79,7 +88,7 @@ def _fitted(
 ) -> Surface:
     k = len(unit)
     root = np.linalg.cholesky(covariance)
-    count = per_term * (1 + k + k * (k + 1) // 2)
+    count = per_term * _coefficients(k)
     drawn = np.clip(unit + rng.normal(size=(count, k)) @ root.T, 0, 1)
     batches = np.array_split(drawn, -(-count // BATCH))
     told = np.concatenate([shares(batch) for batch in batches])

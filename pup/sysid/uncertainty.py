@@ -1,5 +1,6 @@
 """What the recordings say about each parameter around a fitted point."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from pup.physics.parameters import ParameterSpace
 from pup.sysid.gauss_newton import Confidence, confidence
 from pup.sysid.problem import Problem
-from pup.sysid.ripples import Shares, Surface, surface
+from pup.sysid.ripples import Shares, Surface, replays, surface
 from pup.sysid.slopes import Slopes, slopes, told_at
 
 Array = NDArray[np.float64]
@@ -77,7 +78,9 @@ class Spread:
         return self.confidence(1 - (1 - level) / len(self.space))
 
 
-def spread_at(problem: Problem, unit: Array) -> Spread:
+def spread_at(
+    problem: Problem, unit: Array, progress: Callable[[float], None] = lambda _: None
+) -> Spread:
     """What the recordings tell around a fitted point of equation 1.
 
     Where the robot hangs, from the slopes at the point. With contact those are a ripple's, and a
@@ -87,6 +90,7 @@ def spread_at(problem: Problem, unit: Array) -> Spread:
     Args:
       problem: what was fitted.
       unit: the fitted point on the unit cube, shape (n_free,).
+      progress: told the share of the replays that is done.
     """
     on_ground = np.array([r.support == "ground" for r in problem.recordings])
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads
@@ -97,16 +101,22 @@ def spread_at(problem: Problem, unit: Array) -> Spread:
             return Spread(problem.free_space, unit, covariance, np.full(len(unit), np.inf))
         hanging = slopes(told.of(~on_ground), starts)
         rise = RISE * float(problem.losses(unit[None])[0])
-        shares = _shares(problem, on_ground)
+        shares = _shares(problem, on_ground, progress)
         ground = surface(shares, unit, covariance, hanging.curvature, rise)
         return over_ripples(problem.free_space, unit, hanging, ground)
 
 
-def _shares(problem: Problem, chosen: NDArray[np.bool_]) -> Shares:
+def _shares(
+    problem: Problem, chosen: NDArray[np.bool_], progress: Callable[[float], None]
+) -> Shares:
     """What each of some recordings adds to equation 1 over all of them."""
-    part = problem.of(np.flatnonzero(chosen).tolist())
+    part, done = problem.of(np.flatnonzero(chosen).tolist()), 0
+    whole = replays(len(problem.free))
 
     def shares(units: Array) -> Array:
+        nonlocal done
+        progress(done / whole)
+        done += len(units)
         terms = part.loss.terms(part.replay(units))
         # The mean of positions is over all recordings, those of tilt and feet over these anyway.
         return np.asarray(part.loss.shares(terms) + (chosen.mean() - 1) * terms.position)
