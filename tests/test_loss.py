@@ -102,6 +102,31 @@ def test_falls_and_stands_are_weighed_as_the_paper_has_it() -> None:
     assert loss.total(loss.terms(seen), [2]) == pytest.approx([0.0])
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_lean_at_rest_is_no_error_of_what_follows(lost: bool) -> None:
+    """Eight ticks at rest, of which the first four settle, and two after a command."""
+    target = np.zeros((10, 2))
+    target[8:] = 0.5
+    measured = np.tile([0.04, -0.02], (10, 1))
+    stand = recorded(
+        "stand",
+        np.zeros((10, 2)),
+        measured,
+        motion="standup",
+        support="ground",
+        target=target,
+        time=np.arange(10) / 30,
+    )
+    tilt = np.full((10, 2), NAN) if lost else np.zeros((10, 2))
+    tilt[0] = measured[0]
+    if not lost:
+        tilt[9] = [0.03, 0.04]  # since it rested: 0.05
+    told = loss_of(stand).terms(replayed((stand,), tilt=tilt)).tilt[0, 0]
+    settled = np.hypot(0.04, 0.02)  # of the first tick, which is where it was put
+    expected = 9 * np.hypot(LOST_POSITION, LOST_POSITION) if lost else 0.05 + settled
+    assert told == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_what_stands_before_a_recording_does_not_matter(order: tuple[int, int]) -> None:
     """Feet that a suspended recording does not have are no step of the next one's."""

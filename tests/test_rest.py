@@ -38,6 +38,18 @@ def test_the_readings_of_a_rest_are_averaged() -> None:
     np.testing.assert_allclose(np.std(starts), NOISE / np.sqrt(REST), rtol=0.1)
 
 
+def test_a_noisy_imu_does_not_hide_a_rest() -> None:
+    """Half a degree of noise, as a BNO055 has."""
+    rng = np.random.default_rng(0)
+    held = 0
+    for seed in range(100):
+        recording = resting("ground", seed)
+        tilts = rng.normal(0, 0.009, (2, TICKS))
+        extras = {"imu/roll": tilts[0], "imu/pitch": tilts[1]}
+        held += ticks_at_rest(replace(recording, extras=extras)) == REST
+    assert held > 90
+
+
 def test_a_robot_that_hangs_starts_at_its_first_reading() -> None:
     """Nothing grows there, and a servo at 200 Hz may have begun to fall."""
     recording = resting("suspended")

@@ -16,6 +16,10 @@ FEWEST = 4
 DRIFT = 0.004
 """By how much the means of a rest's halves may differ, rad: less than three steps of a 12-bit
 encoder. What drifts less is hardly misread by its mean."""
+MEDIAN_OF_DIFFERENCES = 0.954
+"""Of two normal variables, in absolute value, for a standard deviation of one."""
+CHANCE = 3.0
+"""Standard errors that they may differ by besides."""
 
 
 def ticks_at_rest(recording: Recording) -> int:
@@ -53,5 +57,9 @@ def _tilts(recording: Recording) -> list[Array]:
 
 def _drifts(readings: Array) -> bool:
     """Whether the two halves of a rest (n_ticks, n) differ."""
-    before, after = (half.mean(axis=0) for half in np.array_split(readings, 2))
-    return bool((np.abs(after - before) > DRIFT).any())
+    before, after = np.array_split(readings, 2)
+    # Of what jumps from reading to reading, whichever way they drift.
+    noise = np.median(np.abs(np.diff(readings, axis=0)), axis=0) / MEDIAN_OF_DIFFERENCES
+    error = noise * np.sqrt(1 / len(before) + 1 / len(after))
+    away = np.abs(after.mean(axis=0) - before.mean(axis=0))
+    return bool((away > DRIFT + CHANCE * error).any())

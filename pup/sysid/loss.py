@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics.rest import ticks_at_rest
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.recording import Recording
 from pup.robot import RobotDescription
@@ -63,6 +64,9 @@ class ReplayLoss:
         measured = [not np.isnan(self.tilt[part]).all() for part in self.ticks]
         self.tilting = ground & moving & np.array(measured)
         self.starts = np.array([part.start for part in self.ticks])
+        self.rests = tuple(
+            _rest(r, part.start) for r, part in zip(recordings, self.ticks, strict=True)
+        )
 
     def terms(self, trajectories: Trajectories) -> Terms:
         """The three sums, per candidate and recording."""
@@ -154,9 +158,17 @@ class ReplayLoss:
         return np.nan_to_num(position), np.where(counts[:, None], np.nan_to_num(tilt), 0.0)
 
     def _tilt_error(self, trajectories: Trajectories) -> Array:
-        """Errors of roll and pitch, the short way round the circle."""
-        error = _difference(trajectories.tilt, self.tilt, LOST_POSITION)
-        return (error + np.pi) % (2 * np.pi) - np.pi
+        """Errors of roll and pitch, the short way round the circle; from the rest on, if there is.
+
+        A robot leans where its IMU or the zeros of its encoders are a degree off. With the soles on
+        the floor that says nothing of its dynamics, and would outweigh all that does.
+        """
+        away = trajectories.tilt - self.tilt
+        away = (away + np.pi) % (2 * np.pi) - np.pi
+        for part, rest in zip(self.ticks, self.rests, strict=True):
+            if rest is not None:
+                away[:, part] -= np.nan_to_num(away[:, rest].mean(axis=1, keepdims=True))
+        return np.where(np.isnan(away) & ~np.isnan(self.tilt), LOST_POSITION, away)
 
     def _feet_error(self, trajectories: Trajectories) -> Array:
         """How far the feet moved since the tick before, (n_candidates, n_ticks, 3 n_feet), m.
@@ -181,6 +193,12 @@ def _tilt(recording: Recording) -> Array:
     absent = np.full(len(recording.time), np.nan)
     angles = [recording.extras.get(f"imu/{name}", absent) for name in ("roll", "pitch")]
     return np.stack(angles, axis=1)
+
+
+def _rest(recording: Recording, start: int) -> slice | None:
+    """Ticks of the second half of a rest at the beginning, when a replay has settled, or None."""
+    ticks = ticks_at_rest(recording)
+    return slice(start + ticks // 2, start + ticks) if ticks > 1 else None
 
 
 def _flat(values: Array) -> Array:
