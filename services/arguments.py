@@ -61,10 +61,10 @@ def _run(verb: argparse.ArgumentParser) -> None:
         help="folder of recordings; default: those that come with the robot",
     )
     out(verb, "the results of all stages")
-    budget(verb, generations=100, subset_generations=30)
+    budget(verb, generations=60, subset_generations=30, comparison=False)
     later = verb.add_argument_group("what follows, for robots with a gait")
     for name, limits, default, told in (
-        ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 800000"),
+        ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 300000"),
         ("--trials", (0, 1000), None, "walks of a virtual robot, to choose eta by; default: 25"),
         ("--repeats", (0, 100), 5, "walks of the chosen eta and of the fitted one; default: 5"),
     ):

@@ -103,7 +103,7 @@ def presysid(verb: argparse.ArgumentParser) -> None:
     recordings(verb)
     robot(verb, required=True)
     out(verb, "bounds.json, report.html and checkpoints/")
-    budget(verb, generations=500, subset_generations=100)
+    budget(verb, generations=500, subset_generations=100, comparison=True)
     place(verb)
 
 

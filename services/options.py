@@ -73,7 +73,9 @@ def seed(to: Any, more: str = "") -> None:
     )
 
 
-def budget(verb: argparse.ArgumentParser, generations: int, subset_generations: int) -> None:
+def budget(
+    verb: argparse.ArgumentParser, generations: int, subset_generations: int, comparison: bool
+) -> None:
     """How much pre-sysID does."""
     budget = verb.add_argument_group("what is fitted, and how long")
     actuator(budget)
@@ -99,7 +101,10 @@ def budget(verb: argparse.ArgumentParser, generations: int, subset_generations: 
         help="share of the recordings in a subset, at least two; default: %(default)s",
     )
     budget.add_argument(
-        "--no-comparison", action="store_true", help="do not fit the other torque law"
+        "--comparison",
+        action=argparse.BooleanOptionalAction,
+        default=comparison,
+        help="fit the other torque law too; default: %(default)s",
     )
     budget.add_argument(
         "--fixed-network", action="store_true", help="keep the robot's network weights"

@@ -20,13 +20,13 @@ from services.stages import Journal, Stage, content
 from workers.fits import Runner
 
 SHIPPED = "recordings"
-"""Folder of a built-in robot with recordings of our own, from a concealed virtual robot."""
+"""Folder of a built-in robot with recordings of our own, from virtual robot 0."""
 POLICIES = "policies"
 """Folder of a built-in robot with a bundle for each direction."""
 DIRECTION = "forward"
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
-STEPS = 800_000
-"""Of the training unless told otherwise: three minutes at 4,500 a second."""
+STEPS = 300_000
+"""Of the training unless told otherwise: two minutes at 2,500 a second."""
 TRIALS = 25
 """Walks until eta is chosen (paper)."""
 FURTHER_RATE = 2e-4

@@ -17,7 +17,7 @@ from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
-from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range
+from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range, widened
 from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
@@ -218,9 +218,12 @@ class _Job:
         at = space.normalise(space.nominal)
         spread = spread_at(bounded, at, self._uncertainty)
         known, together = spread.confidence(0.9), spread.together(0.95)
-        lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
-        # A few subsets, all pulled to the nominal point, may differ by less than the data allow.
-        lower, upper = np.minimum(lower, together.lower), np.maximum(upper, together.upper)
+        lower, upper = widened(
+            expanded_range(np.vstack([values, space.nominal]), space),
+            (together.lower, together.upper),
+        )
+        lower = np.where(spread.unseen, space.lower, lower)
+        upper = np.where(spread.unseen, space.upper, upper)
         actuator = self.options.actuator
         main, nominal = full[actuator], fitted["nominal", actuator]
         phi = [n for n in bounded.space.names if n in NETWORK_NAMES]

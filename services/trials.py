@@ -20,6 +20,8 @@ from services.transfer import Gateway, Wanted, transfer
 
 SCHEMA = 1
 STUDY = "run"
+CHARACTER = 0
+"""Decides on the virtual robot's physics: those of the recordings that come with `darwin_op2`."""
 ATTEMPTS = 3
 """To run a trial, before another one takes its place."""
 HOPELESS = 10
@@ -35,7 +37,7 @@ class Budget:
     Attributes:
       trials: until eta is chosen (paper: 25).
       repeats: of the chosen eta afterwards, and of the fitted one (paper: 5).
-      seed: of the virtual robot's physics and of the search.
+      seed: of the search.
       horizon: the longest walk, s.
     """
 
@@ -72,7 +74,7 @@ def try_out(
     """
     bundle = NumpyPolicy.load(policy, robot)
     fitted = fitted_eta(bundle, read_bounds(bounds, robot))
-    with Laboratory(out, robot, policy, budget.seed) as laboratory:
+    with Laboratory(out, robot, policy, CHARACTER) as laboratory:
         study = follow(laboratory, STUDY, budget, [fitted.tolist()], out, told)
     document = _document(study, fitted, budget, policy)
     write_json(out / "transfer.json", document)
@@ -178,7 +180,7 @@ def _document(
         "schema": SCHEMA,
         "robot": study["robot"],
         "policy_sha256": sha256(policy / CARD),
-        "virtual_robot": budget.seed,
+        "virtual_robot": CHARACTER,
         "horizon": study["settings"]["horizon"],
         "eta": study["eta"],
         "fitted_eta": fitted.tolist(),

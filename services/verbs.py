@@ -283,7 +283,7 @@ def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
         subset_generations=options.subset_generations,
         fraction=options.fraction,
         folds=options.folds,
-        compare=not options.no_comparison,
+        compare=options.comparison,
         fixed_network=options.fixed_network,
         seed=options.seed,
     )

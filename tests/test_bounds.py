@@ -14,6 +14,7 @@ from pup.sysid.bounds import (
     draw_subsets,
     expanded_range,
     two_cluster_p,
+    widened,
 )
 
 SPACE = ParameterSpace(
@@ -164,3 +165,11 @@ def test_recordings_shared_by_subsets_raise_no_alarm(monkeypatch: pytest.MonkeyP
         fits = np.array([optima[list(subset)].mean(axis=0) for subset in subsets])
         alarms += any(s.split for s in contact_splits(fits, SPACE, subsets, ground, seed))
     assert alarms / 200 <= SPLIT_LEVEL + 3 * np.sqrt(SPLIT_LEVEL * (1 - SPLIT_LEVEL) / 200)
+
+
+def test_an_interval_widens_a_range_but_not_without_end() -> None:
+    """By at most its own width at each end, and never narrows it."""
+    low, high = np.array([1.0, 1.0, 1.0]), np.array([2.0, 2.0, 2.0])
+    lower, upper = np.array([0.5, -8.0, 1.2]), np.array([1.5, 9.0, 1.4])
+    found = widened((low, high), (lower, upper))
+    np.testing.assert_allclose(found, [[0.5, 0.0, 1.0], [2.0, 3.0, 2.0]])

@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 
 EXPANSION = 0.1
 """The range grows by this share of its width at both ends (paper, Algorithm 1)."""
+WIDENING = 1.0
+"""Share of its width by which an interval of the fit may widen a range, at each end."""
 PERMUTATIONS = 10_000
 SPLIT_LEVEL = 0.05
 
@@ -44,6 +46,25 @@ def expanded_range(fits: Array, space: ParameterSpace) -> tuple[Array, Array]:
     low, high = np.nanmin(fits, axis=0), np.nanmax(fits, axis=0)
     margin = EXPANSION * (high - low)
     return np.maximum(low - margin, space.lower), np.minimum(high + margin, space.upper)
+
+
+def widened(range_: tuple[Array, Array], interval: tuple[Array, Array]) -> tuple[Array, Array]:
+    """A range that holds an interval, as far as it is not much wider.
+
+    A few subsets, all pulled to the nominal point, may differ by less than the recordings leave
+    open. Where they contradict the model, though, an interval covers nearly everything, and a
+    policy that is trained for everything walks nowhere.
+
+    Args:
+      range_: lower and upper bounds, shape (n_parameters,) each.
+      interval: likewise.
+    """
+    (low, high), (lower, upper) = range_, interval
+    most = WIDENING * (high - low)
+    return (
+        np.minimum(low, np.maximum(lower, low - most)),
+        np.maximum(high, np.minimum(upper, high + most)),
+    )
 
 
 @dataclass(frozen=True)

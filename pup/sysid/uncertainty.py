@@ -66,12 +66,16 @@ class Spread:
     def confidence(self, level: float) -> Confidence:
         """Intervals that hold each parameter so often; what is not seen gets its whole range."""
         told = confidence(self.space, self.centre, self.covariance, self.freedom, level)
-        unseen = np.sqrt(UNIFORM * np.diag(self.covariance)) > UNSEEN
         return replace(
             told,
-            lower=np.where(unseen, self.space.lower, told.lower),
-            upper=np.where(unseen, self.space.upper, told.upper),
+            lower=np.where(self.unseen, self.space.lower, told.lower),
+            upper=np.where(self.unseen, self.space.upper, told.upper),
         )
+
+    @property
+    def unseen(self) -> NDArray[np.bool_]:
+        """Which parameters the recordings tell next to nothing of, shape (n_parameters,)."""
+        return np.asarray(np.sqrt(UNIFORM * np.diag(self.covariance)) > UNSEEN)
 
     def together(self, level: float) -> Confidence:
         """Intervals that hold all parameters at once so often (Bonferroni)."""
