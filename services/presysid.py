@@ -218,10 +218,8 @@ class _Job:
         at = space.normalise(space.nominal)
         spread = spread_at(bounded, at, self._uncertainty)
         known, together = spread.confidence(0.9), spread.together(0.95)
-        lower, upper = widened(
-            expanded_range(np.vstack([values, space.nominal]), space),
-            (together.lower, together.upper),
-        )
+        lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
+        lower, upper = widened(lower, upper, (together.lower, together.upper), space)
         lower = np.where(spread.unseen, space.lower, lower)
         upper = np.where(spread.unseen, space.upper, upper)
         actuator = self.options.actuator

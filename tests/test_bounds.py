@@ -168,8 +168,9 @@ def test_recordings_shared_by_subsets_raise_no_alarm(monkeypatch: pytest.MonkeyP
 
 
 def test_an_interval_widens_a_range_but_not_without_end() -> None:
-    """By at most its own width at each end, and never narrows it."""
-    low, high = np.array([1.0, 1.0, 1.0]), np.array([2.0, 2.0, 2.0])
-    lower, upper = np.array([0.5, -8.0, 1.2]), np.array([1.5, 9.0, 1.4])
-    found = widened((low, high), (lower, upper))
-    np.testing.assert_allclose(found, [[0.5, 0.0, 1.0], [2.0, 3.0, 2.0]])
+    """By at most a twentieth of the search range at each end; and it never narrows one."""
+    space = ParameterSpace(("a", "b", "c"), ("1",) * 3, np.ones(3), np.zeros(3), np.full(3, 10.0))
+    low, high = np.full(3, 1.0), np.full(3, 2.0)
+    interval = np.array([0.8, -8.0, 1.2]), np.array([1.5, 9.0, 1.4])
+    found = widened(low, high, interval, space)
+    np.testing.assert_allclose(found, [[0.8, 0.5, 1.0], [2.0, 2.5, 2.0]])

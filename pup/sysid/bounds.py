@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 
 EXPANSION = 0.1
 """The range grows by this share of its width at both ends (paper, Algorithm 1)."""
-WIDENING = 1.0
-"""Share of its width by which an interval of the fit may widen a range, at each end."""
+WIDENING = 0.05
+"""Share of the search range by which an interval of the fit may widen a range, at each end."""
 PERMUTATIONS = 10_000
 SPLIT_LEVEL = 0.05
 
@@ -48,22 +48,25 @@ def expanded_range(fits: Array, space: ParameterSpace) -> tuple[Array, Array]:
     return np.maximum(low - margin, space.lower), np.minimum(high + margin, space.upper)
 
 
-def widened(range_: tuple[Array, Array], interval: tuple[Array, Array]) -> tuple[Array, Array]:
-    """A range that holds an interval, as far as it is not much wider.
+def widened(
+    low: Array, high: Array, interval: tuple[Array, Array], space: ParameterSpace
+) -> tuple[Array, Array]:
+    """A range that holds an interval, as far as that is little wider.
 
     A few subsets, all pulled to the nominal point, may differ by less than the recordings leave
     open. Where they contradict the model, though, an interval covers nearly everything, and a
     policy that is trained for everything walks nowhere.
 
     Args:
-      range_: lower and upper bounds, shape (n_parameters,) each.
-      interval: likewise.
+      low: lower bounds, shape (n_parameters,).
+      high: upper bounds.
+      interval: its ends, likewise.
+      space: of the parameters.
     """
-    (low, high), (lower, upper) = range_, interval
-    most = WIDENING * (high - low)
+    most = WIDENING * (space.upper - space.lower)
     return (
-        np.minimum(low, np.maximum(lower, low - most)),
-        np.maximum(high, np.minimum(upper, high + most)),
+        np.minimum(low, np.maximum(interval[0], low - most)),
+        np.maximum(high, np.minimum(interval[1], high + most)),
     )
 
 
