@@ -27,10 +27,10 @@ KINDS = (
 )
 
 
-def main(folder: Path = RECORDINGS, kinds: tuple[str, ...] = KINDS) -> None:
+def main(folder: Path = RECORDINGS) -> None:
     """Play the scripts and write what was read."""
     robot = RobotDescription.load("darwin_op2")
-    motions = script(robot, kinds, np.random.default_rng(SEED), jitter=True)
+    motions = script(robot, KINDS, np.random.default_rng(SEED), jitter=True)
     with virtual_robot(robot, CHARACTER, Path("/dev/null")) as doors:
         player = Player(robot, doors, CHARACTER)
         made = [player.play(m, m.id, SEED + i, None) for i, m in enumerate(motions)]

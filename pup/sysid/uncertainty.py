@@ -140,14 +140,14 @@ def over_ripples(space: ParameterSpace, unit: Array, hanging: Slopes, ground: Su
     count = len(ground.slopes)
     mean = ground.slopes.mean(axis=0)
     off = (ground.slopes - mean) / np.sqrt(count * max(count - 1, 1))
-    inverse = np.linalg.inv(hanging.curvature + ground.at_least)
-    step = -inverse @ (hanging.gradient + mean)
-    far = float(np.sqrt(step @ np.linalg.solve(ground.draws, step)))
     both = Slopes(
         hanging.gradient + mean,
         hanging.curvature + ground.curvature,
         hanging.scatter + ground.slope_error + off.T @ off,
     )
+    inverse = np.linalg.inv(hanging.curvature + ground.at_least)
+    step = -inverse @ both.gradient
+    far = float(np.sqrt(step @ np.linalg.solve(ground.draws, step)))
     # After Welch and Satterthwaite: only the scatter over recordings is an estimate, and a normal
     # variable's fourth moment is three times its variance's square.
     squares = (off @ inverse) ** 2
