@@ -36,6 +36,7 @@ from pup.wire import (
 )
 
 SAMPLES = 0.2  # s between two samples
+COOL = "cool"  # what a trial waits for while a winding is hot
 
 
 class Stage(StrEnum):
@@ -161,6 +162,7 @@ class Conductor:
             self._take(current)
         if self.stage is Stage.WAITING:
             self._start()
+        self._motion.hurry(self.stage is Stage.WAITING and self.waiting == COOL)
         if self._future is not None and self._future.done():
             self._collect(self._future)
 
@@ -202,7 +204,7 @@ class Conductor:
             hottest = np.nanmax(np.append(status.senses.temperature, -273.0))
             safety = self._settings.safety
             if hottest > safety.cool or status.heat > safety.rested:
-                return "cool"
+                return COOL
         if self._settings.control.gate == "operator" and not self._armed:
             return "arm"
         return ""

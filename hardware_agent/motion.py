@@ -72,6 +72,7 @@ class Motion(threading.Thread):
         self._state, self._reason = AgentState.DISABLED, ""
         self._bus = body.ready
         self._limited: dict[str, str] = {}
+        self._hurried = False
         self._count = 0
         self._timing = self.metronome.timing()
         self.status = self._told(None)
@@ -113,6 +114,10 @@ class Motion(threading.Thread):
         """How far the robot came is known: time may go on where it stood still for that."""
         if self.metronome.lockstep:
             self._ask(lambda senses: None)
+
+    def hurry(self, hurried: bool) -> None:
+        """Whether something waits for time to pass: lock-step need not keep to the clock then."""
+        self._hurried = hurried
 
     def close(self) -> None:
         """End the thread; the robot is limp afterwards."""
@@ -165,7 +170,8 @@ class Motion(threading.Thread):
             self._trip(Trip("bus", str(error)), None)
             self._tell()
             senses = None
-        self.metronome.pace(not isinstance(self._activity, Ramp | Settle | Walk))
+        busy = isinstance(self._activity, Ramp | Settle | Walk)
+        self.metronome.pace(not (busy or self._hurried))
         self._count += 1
         if self._count % STATISTICS == 0:
             self._timing = self.metronome.timing()

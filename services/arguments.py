@@ -61,7 +61,13 @@ def _run(verb: argparse.ArgumentParser) -> None:
         help="folder of recordings; default: those that come with the robot",
     )
     out(verb, "the results of all stages")
-    budget(verb, generations=60, subset_generations=30, comparison=False)
+    budget(
+        verb,
+        generations=20,
+        subset_generations=30,
+        comparison=False,
+        start="the robot's own identified.json, without one the values of robot.toml",
+    )
     later = verb.add_argument_group("what follows, for robots with a gait")
     for name, limits, default, told in (
         ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 300000"),

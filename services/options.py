@@ -74,9 +74,13 @@ def seed(to: Any, more: str = "") -> None:
 
 
 def budget(
-    verb: argparse.ArgumentParser, generations: int, subset_generations: int, comparison: bool
+    verb: argparse.ArgumentParser,
+    generations: int,
+    subset_generations: int,
+    comparison: bool,
+    start: str = "values of robot.toml",
 ) -> None:
-    """How much pre-sysID does."""
+    """How much pre-sysID does; `start` tells where it begins unless told otherwise."""
     budget = verb.add_argument_group("what is fitted, and how long")
     actuator(budget)
     for name, limits, default, told in (
@@ -108,6 +112,12 @@ def budget(
     )
     budget.add_argument(
         "--fixed-network", action="store_true", help="keep the robot's network weights"
+    )
+    budget.add_argument(
+        "--start",
+        type=Path,
+        metavar="FILE",
+        help=f"bounds.json or identified.json where the nominal fit begins; default: {start}",
     )
     seed(budget)
 

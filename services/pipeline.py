@@ -136,7 +136,7 @@ class _Job:
                 identify(self.robot, recordings, self.options, folder, fits, progress, threads)
 
         files = (BOUNDS, "presysid/report.html")
-        return Stage("presysid", self._measured() | _told(self.options), files, work)
+        return Stage("presysid", self._measured() | _told(self.options.told()), files, work)
 
     def _replay(self) -> Stage:
         def work() -> None:
@@ -165,7 +165,7 @@ class _Job:
 
         begun = {} if start is None else {"policy that it starts from": sha256(start / CARD)}
         inputs = self._described() | self._hash(BOUNDS) | begun
-        inputs |= _told(replace(options, start=None))
+        inputs |= _told(asdict(replace(options, start=None)))
         bundle = [f"{POLICY}/{name}" for name in (CARD, WEIGHTS, GRAPH)]
         files = ("train/training.json", *bundle, "train/curve.png")
         return Stage("train", inputs, files, work, folder="train", remade=True)
@@ -201,7 +201,7 @@ class _Job:
 
         used = {"policy": sha256(policy / CARD)} | self._described() | self._hash(BOUNDS)
         files = ("transfer/transfer.json", "transfer/study.json")
-        return Stage("transfer", used | _told(budget), files, work, folder="transfer")
+        return Stage("transfer", used | _told(asdict(budget)), files, work, folder="transfer")
 
     def _report(self, documents: Mapping[str, Any]) -> Stage:
         from services.job_report import Job, write_report
@@ -257,9 +257,9 @@ class _Job:
         return {name: sha256(self.out / name) for name in names}
 
 
-def _told(options: Any) -> dict[str, str]:
+def _told(options: Mapping[str, Any]) -> dict[str, str]:
     """Options as the journal has them."""
-    return {"options": json.dumps(asdict(options), sort_keys=True, default=str)}
+    return {"options": json.dumps(options, sort_keys=True, default=str)}
 
 
 def default_recordings(robot: RobotDescription) -> tuple[Recording, ...]:

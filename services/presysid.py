@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.files import sha256
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
 from pup.recording import Recording
@@ -21,15 +22,18 @@ from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range
 from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
-from pup.sysid.result import Bounds, SubsetFit
+from pup.sysid.result import Bounds, SubsetFit, read_fitted
 from pup.sysid.uncertainty import observable, spread_at
 from workers.fits import Fit, Runner, Status
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, Sequence[Status]], None]
 
-SUBSET_SIGMA = 0.05
-"""First step of a subset's fit around the nominal point, as the authors' code has it."""
+NEAR_SIGMA = 0.05
+"""First step of a subset's fit around the nominal point, as the authors' code has it, and of a
+nominal fit that begins at another robot's."""
+FAR_SIGMA = 0.25
+"""First step of a nominal fit that begins at a description's values."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class Options:
       fixed_network: keep the robot's network weights instead of fitting them. Free weights can
         trade places with rho and sigma, whose values then mean something only beside them.
       seed: of everything random.
+      start: bounds file whose fitted values stand in for those of the robot's description: fits of
+        its torque law begin there, and what the recordings cannot see stays there.
     """
 
     actuator: Actuator = "nn_pd"
@@ -60,6 +66,11 @@ class Options:
     compare: bool = True
     fixed_network: bool = False
     seed: int = 0
+    start: Path | None = None
+
+    def told(self) -> dict[str, Any]:
+        """As files have it: a file is known by its content, wherever it lies."""
+        return asdict(self) | {"start": self.start and sha256(self.start)}
 
 
 def identify(
@@ -83,7 +94,7 @@ def identify(
       threads: cores for the replays made in this process.
 
     Raises:
-      InputError: there is nothing to fit, or a checkpoint is of another fit.
+      InputError: there is nothing to fit, a checkpoint is of another fit, or the start is not one.
     """
     job = _Job(robot, tuple(recordings), options, out, runner, progress, threads)
     return job.run()
@@ -109,6 +120,12 @@ class _Job:
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
         compared: tuple[Actuator, ...] = (robot.actuator, "pd") if options.compare else ()
         self.actuators = tuple(dict.fromkeys((options.actuator, *compared)))
+        self.known: dict[Actuator, ParameterSpace] = {}
+        if options.start is not None:
+            kind, space = read_fitted(options.start, robot)
+            if kind not in self.actuators:
+                raise InputError(f"{options.start}: of the {kind} torque law, which is not fitted")
+            self.known[kind] = space
 
     def run(self) -> Bounds:
         begin = time.time()
@@ -138,7 +155,8 @@ class _Job:
 
     def _problem(self, actuator: Actuator) -> Problem:
         """All recordings, with the parameters free that they can see."""
-        space = robot_space(self.robot, actuator)
+        known = self.known.get(actuator)
+        space = robot_space(self.robot, actuator) if known is None else known
         free = tuple(
             n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
         )
@@ -150,20 +168,17 @@ class _Job:
         """The nominal fit and the folds' fits of each torque law."""
         fits: dict[tuple[str, Actuator], Fit] = {}
         for actuator, problem in full.items():
-            fits["nominal", actuator] = self._from_scratch(f"nominal_{actuator}", problem)
+            fits["nominal", actuator] = self._fit_of_all(f"nominal_{actuator}", problem)
             for k, kept in enumerate(self._folds()):
                 name = f"fold{k}of{self.options.folds}_{actuator}"
-                fits[f"fold{k}", actuator] = self._from_scratch(name, problem.of(kept))
+                fits[f"fold{k}", actuator] = self._fit_of_all(name, problem.of(kept))
         return dict(zip(fits, self._fit("nominal fits", list(fits.values())), strict=True))
 
-    def _from_scratch(self, name: str, problem: Problem) -> Fit:
+    def _fit_of_all(self, name: str, problem: Problem) -> Fit:
         o = self.options
         start = problem.free_space.normalise(problem.free_space.nominal)
-        return Fit(
-            name,
-            problem,
-            FitSettings(start, 0.25, o.population, o.generations, o.seed),
-        )
+        sigma = NEAR_SIGMA if problem.actuator in self.known else FAR_SIGMA
+        return Fit(name, problem, FitSettings(start, sigma, o.population, o.generations, o.seed))
 
     def _folds(self) -> list[tuple[int, ...]]:
         """Recordings kept in each fold.
@@ -189,7 +204,7 @@ class _Job:
             problem = replace(problem, free=observable(problem, nominal))
             at = problem.free_space.normalise(problem.free_space.nominal)
             settings = FitSettings(
-                at, SUBSET_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
+                at, NEAR_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
             )
             fits.append(Fit(f"subset{i}", problem, settings))
         # They start from the nominal fit: another one, after more generations, makes them others.
@@ -282,7 +297,7 @@ class _Job:
     def _provenance(self, seconds: float) -> dict[str, Any]:
         packages = ("pup", "mujoco", "nevergrad", "numpy")
         return {
-            "options": asdict(self.options),
+            "options": self.options.told(),
             "robot_digest": self.robot.digest,
             "recordings": {r.id: r.digest for r in self.recordings},
             "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
     given = options.recordings
     recordings = load_recordings([given], robot) if given else default_recordings(robot)
     budget = _budget(options, robot)
+    if budget.start is None and _identified(robot) == budget.actuator:
+        budget = replace(budget, start=robot.identified_path)
     mission = Mission(budget, options.train_steps, options.trials, options.repeats)
     means = Means(
         lambda: places.fits(options),
@@ -286,7 +289,15 @@ def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
         compare=options.comparison,
         fixed_network=options.fixed_network,
         seed=options.seed,
+        start=options.start,
     )
+
+
+def _identified(robot: RobotDescription) -> str | None:
+    """The torque law of a robot's own fit, where it has one."""
+    from pup.sysid.result import read_fitted
+
+    return read_fitted(robot.identified_path, robot)[0] if robot.identified_path.is_file() else None
 
 
 @contextmanager

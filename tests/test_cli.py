@@ -1,5 +1,6 @@
 """The command line: what each verb writes, prints and answers."""
 
+import hashlib
 import json
 import os
 import pty
@@ -158,6 +159,25 @@ def test_presysid_takes_more_generations_of_the_same_search(
     for name, history in done.json()["presysid"]["histories"].items():
         assert history[:2] == before[name][:2]
         assert len(history) >= 3
+
+
+def test_presysid_begins_where_it_is_told_to(
+    bench_recordings: Path, identified: Path, tmp_path: Path
+) -> None:
+    """A fit that starts at what another one found is never worse."""
+    known = json.loads((identified / "bounds.json").read_text())
+    start = shutil.copy(identified / "bounds.json", tmp_path / "known.json")
+    kind, out = known["actuator"]["kind"], tmp_path / "out"
+    done = pup(
+        *("presysid", bench_recordings, "--robot", "servo_bench", "--out", out, *TINY),
+        *("--actuator", kind, "--start", start, "--json"),
+    )
+    assert done.code == 0, done.err
+    told = done.json()["presysid"]["loss"]["train"]
+    assert told["loss_before"] == pytest.approx(known["loss"]["train"]["loss"], rel=1e-9)
+    assert told["loss"] <= told["loss_before"] * (1 + 1e-12)
+    options = done.json()["presysid"]["provenance"]["options"]
+    assert options["start"] == hashlib.sha256(start.read_bytes()).hexdigest()
 
 
 def test_presysid_takes_the_torque_law_that_a_robot_has(tmp_path: Path, check: Check) -> None:

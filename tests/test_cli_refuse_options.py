@@ -1,5 +1,6 @@
 """The command line: bad options and places end with exit code 2, one clear line and no file."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 from commandline import TINY, files, pup, pup_process
 from refusals import LOG, TOLD, Cases, Made, Place, assert_refused, check
+
+from pup.robot import RobotDescription
 
 case = Cases()
 
@@ -250,6 +253,19 @@ def test_refuses_the_checkpoints_of_another_seed(place: Place, identified: Path)
     before = files(place.here)
     assert_refused(pup(*place.presysid("--seed", 1)), "settings", "use another --out")
     assert files(place.here) == before
+
+
+def test_refuses_a_start_that_is_none(place: Place, identified: Path) -> None:
+    known = shutil.copy(identified / "bounds.json", place.here / "known.json")
+    other = RobotDescription.load("darwin_op2").identified_path
+    law = "nn_pd" if json.loads(known.read_text())["actuator"]["kind"] == "pd" else "pd"
+    for options, words in (
+        (("--start", place.here / "none.json"), ("none.json",)),
+        (("--start", other), (other, "darwin_op2", "servo_bench")),
+        (("--start", known, "--actuator", law), (known, "torque law", "not fitted")),
+    ):
+        assert_refused(pup(*place.presysid(*options)), *words)
+        assert not place.out.exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"hello"])

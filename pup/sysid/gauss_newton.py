@@ -5,7 +5,7 @@ trial steps, tried at many dampings at once. That is what makes it the quick fit
 replays does not grow with the number of parameters.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,8 @@ side of a kink, a wide one the slope across many.
 """
 CURVATURE_STEP = 1e-3
 """The same for the covariance: a wider one takes kinks for information."""
+TOLERANCE = 1e-4
+"""Relative improvement of the cost below which it stops."""
 FIRST_DAMPING = 1e-2
 DAMPINGS = 10.0 ** np.arange(-3.0, 2.0)
 """Damping factors tried at once, relative to the current one."""
@@ -83,7 +85,7 @@ def least_squares(
     iterations: int = 30,
     prior_mean: Array | None = None,
     prior_sd: Array | None = None,
-    tolerance: float = 1e-4,
+    tolerance: float = TOLERANCE,
     step: float | None = None,
 ) -> LeastSquares:
     """Minimise the sum of squared residuals over the unit cube.
@@ -100,10 +102,61 @@ def least_squares(
     """
     prior = _Prior(start, prior_mean, prior_sd)
     steps = STEPS if step is None else (step,)
-    at = np.clip(start, 0.0, 1.0)
+    reached = _descend(residuals, np.clip(start, 0.0, 1.0), prior, iterations, tolerance, steps)
+    at, value = reached.at, reached.value
+    jacobian = differences(residuals, at, value, CURVATURE_STEP if step is None else step)
+    freedom = max(1, len(value) - len(at))
+    noise = float(np.sqrt(value @ value / freedom))
+    covariance = _covariance(jacobian, noise, prior)
+    replays = reached.replays + len(at)
+    return LeastSquares(at, reached.cost, reached.converged, replays, covariance, noise)
+
+
+def least_point(
+    residuals: Residuals,
+    start: Array,
+    anchor: Array | None,
+    sd: float,
+    iterations: int,
+    step: float,
+) -> Array:
+    """Where the sum of squared residuals is least, without what `least_squares` tells besides.
+
+    Args:
+      residuals: as there.
+      start: likewise.
+      anchor: centre of the prior, or None for no prior.
+      sd: its standard deviation, the same for all parameters.
+      iterations: at most this many Jacobians.
+      step: of the finite differences on the unit cube.
+    """
+    prior = _Prior(start, anchor, None if anchor is None else np.full(len(start), sd))
+    return _descend(residuals, np.clip(start, 0.0, 1.0), prior, iterations, TOLERANCE, (step,)).at
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """Where a descent has led."""
+
+    at: Array
+    value: Array
+    cost: float
+    converged: bool
+    replays: int
+
+
+def _descend(
+    residuals: Residuals,
+    at: Array,
+    prior: "_Prior",
+    iterations: int,
+    tolerance: float,
+    steps: Sequence[float],
+) -> _Reached:
+    """Levenberg-Marquardt from a point within the cube."""
     value = residuals(at[None])[0]
     cost = prior.cost(value, at)
-    replays, width, damping, converged = 1, 0, FIRST_DAMPING, False
+    replays, width, damping = 1, 0, FIRST_DAMPING
     for _ in range(iterations):
         jacobian = differences(residuals, at, value, steps[width])
         replays += len(at)
@@ -127,13 +180,8 @@ def least_squares(
         elif width + 1 < len(steps):
             width, damping = width + 1, FIRST_DAMPING
         else:
-            converged = True
-            break
-    jacobian = differences(residuals, at, value, CURVATURE_STEP if step is None else step)
-    freedom = max(1, len(value) - len(at))
-    noise = float(np.sqrt(value @ value / freedom))
-    covariance = _covariance(jacobian, noise, prior)
-    return LeastSquares(at, cost, converged, replays + len(at), covariance, noise)
+            return _Reached(at, value, cost, True, replays)
+    return _Reached(at, value, cost, False, replays)
 
 
 def confidence(

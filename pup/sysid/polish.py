@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.sysid.fit import W_REG
-from pup.sysid.gauss_newton import least_squares
+from pup.sysid.gauss_newton import least_point
 
 Array = NDArray[np.float64]
 Errors = Callable[[Array], tuple[Array, NDArray[np.int64]]]
@@ -70,11 +70,7 @@ def _squares(
     def weighted(unit: Array) -> Array:
         return np.asarray(errors(unit)[0] * weight)
 
-    sd = None if anchor is None else np.full(len(at), (2 * W_REG) ** -0.5)
-    fit = least_squares(
-        weighted, at, iterations=iterations, prior_mean=anchor, prior_sd=sd, step=STEP
-    )
-    return fit.best
+    return least_point(weighted, at, anchor, (2 * W_REG) ** -0.5, iterations, STEP)
 
 
 def _norms(error: Array, blocks: NDArray[np.int64]) -> Array:
