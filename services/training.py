@@ -38,8 +38,6 @@ from workers.rollouts import Sampling
 from workers.walking import Walking
 
 CHECKPOINT_SECONDS = 30.0
-LEARNER_THREADS = 4
-"""At most: the networks are small."""
 SMOOTHED = 10
 """Iterations whose mean return says which weights were best so far."""
 ETAS = 20_000
@@ -261,8 +259,7 @@ class _Job:
             )
         share = cores // max(1, o.runners)
         sampling = Sampling(self.walking, o.simulations, o.length, o.seed, share)
-        learning = replace(self.learning, threads=min(cores, LEARNER_THREADS))
-        return Setup(self.shape, sampling, learning, o.runners, share, o.seed, self.first)
+        return Setup(self.shape, sampling, self.learning, o.runners, share, o.seed, self.first)
 
     def _per_iteration(self) -> int:
         o = self.options
