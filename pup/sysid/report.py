@@ -160,9 +160,10 @@ class _Report:
         yield tag(
             "p",
             "Nominal: the fit to all recordings. Lower and upper: the range of this and of the "
-            "fits to random subsets, 10 % wider at both ends; where the recordings do not "
-            "identify a parameter, at least its 90 % interval. 90 % interval: how far the nominal "
-            "fit is determined if the model is right.",
+            "fits to random subsets, 10 % wider at both ends, and widened towards an interval that "
+            "holds all parameters at once in 95 % of cases, by a twentieth of the search range at "
+            "most; the whole search range where the recordings tell next to nothing. 90 % "
+            "interval: how far the nominal fit is determined if the model is right.",
         )
         if any(wording.at_edge(bounds)):
             yield tag(
@@ -185,6 +186,8 @@ class _Report:
             yield tag("p", "No history of the fits was kept.")
             return
         ends = [f"{LABELS.get(n, n)} ends at {wording.number(h[-1])}" for n, h in known.items()]
+        law, after = self.bounds.actuator, self.bounds.train["loss"]
+        ends.append(f"{LABELS.get(law, law)} polished by least squares at {wording.number(after)}")
         yield tag("p", f"{wording.listed(ends)}.")
         yield figure(
             convergence(known),
