@@ -98,8 +98,6 @@ def both_ways(
         if name in state:
             now = sensed[0] if name == "read_position" else begun.qpos[:, 3:7]
             state[name] = np.repeat(now[:, None], state[name].shape[1], axis=1)
-    if "bias" in state:
-        state["bias"] = begun.batch.bind("qfrc_bias")[:, begun.group.model.dofs].copy()
     ours.restore(state)
     seen = []
     for target in targets:
@@ -235,7 +233,6 @@ def test_the_state_of_every_kind_of_effect_is_in_the_tasks_state() -> None:
         ("command_delay", ("held", "told")),
         ("measurement_delay", ("read_position",)),
         ("imu_delay", ("read_torso",)),
-        ("load_dependent_friction", ("bias",)),
     ):
         for name in names:
             kept = f"simulations/{name}"

@@ -106,14 +106,14 @@ def test_presliding_is_a_spring_that_yields() -> None:
 def test_a_loaded_gear_costs_torque_going_up_and_saves_it_going_down(
     mass: float, speed: float
 ) -> None:
-    """Friction of a share of |motor + load|, or of the motor's torque alone, by the way."""
+    """Friction of a share of what the gear takes and passes on, or of the motor's torque alone."""
     run = ramp(speed, 0.6, 2.0, setup={"mass": mass})
     by_load, lossy = bench(
         run, {f"load_dependent_friction/share{AT}": 0.2}, {f"gear_efficiency/loss{AT}": 0.2}
     )
     up = np.sign(speed)
     for read, factor in (
-        (by_load, (1 + up * 0.2) / (1 - up * 0.2)),
+        (by_load, 1 / (1 - up * 0.4)),
         (lossy, 1 / (1 - up * 0.2)),
     ):
         motor = KP * (run.target[-1, 0] - read[-1]) - KD * speed

@@ -120,8 +120,13 @@ def one_sided(t: float, x: Array, target: float) -> tuple[float, Sequence[float]
 
 def by_load(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     q, v, z = x
-    motor = servo(target - q, v)
-    return motor + weight(q) - 0.15 * abs(motor - weight(q)) * z / GRIP, [bristle(v, z)]
+    motor, slip = servo(target - q, v), 0.15 * z / GRIP
+    # The load is |2 motor - rotor acceleration|, and brakes the acceleration: try either sign.
+    for sign in (1, -1):
+        torque = (motor + weight(q) - sign * slip * 2 * motor) / (1 - sign * slip * ROTOR / INERTIA)
+        if sign * (2 * motor - ROTOR * torque / INERTIA) >= 0:
+            break
+    return torque, [bristle(v, z)]
 
 
 def lossy(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
@@ -132,7 +137,7 @@ def lossy(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
 
 def lagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     q, v, torque = x
-    return torque + weight(q), [(servo(target - q, v) - torque) / 0.008]
+    return torque - KD * v + weight(q), [(servo(target - q, v) + KD * v - torque) / 0.008]
 
 
 def sagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:

@@ -206,12 +206,9 @@ class Part:
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.force, self.damping = self.batch.bind("qfrc_applied"), self.batch.expand("dof_damping")
         self.sensed, self.contacts = self.batch.bind("sensordata"), self.batch.bind("ncon")
-        self.wrenches = self.bias = None
-        if self.live is not None:
-            if any(term.answers("push") for term in self.live.terms):
-                self.wrenches = self.batch.bind("xfrc_applied")
-            if self.live.servos.loaded:
-                self.bias = self.batch.bind("qfrc_bias")
+        self.wrenches = None
+        if self.live is not None and any(term.answers("push") for term in self.live.terms):
+            self.wrenches = self.batch.bind("xfrc_applied")
 
     def start(
         self, rows: Rows, candidates: Candidates, timestep: Array, qpos: Array, qvel: Array
@@ -238,9 +235,7 @@ class Part:
         else:
             link = qpos[:, model.qpos], qvel[:, model.dofs]
             self._push(ids, outfit)
-            if self.bias is not None:
-                self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
-            self.live.start(rows, outfit, candidates, link, qpos[:, 3:7], self._bias(rows))
+            self.live.start(rows, outfit, candidates, link, qpos[:, 3:7])
         return self._pose(rows)
 
     def _as_it_stands(self, ids: NDArray[np.int32], outfit: Outfit, qpos: Array) -> Array:
@@ -268,10 +263,6 @@ class Part:
                 if term.answers("push"):
                     term.push(wrenches)
             self.wrenches[ids] = wrenches
-
-    def _bias(self, rows: Rows | slice) -> Array | None:
-        """Torques of gravity and motion where a sub-step began, for terms that ask; N m."""
-        return None if self.bias is None else self.bias[rows][:, self.model.dofs]
 
     def _pose(self, rows: Rows) -> Pose:
         root = self.qpos[rows, :7]
@@ -305,7 +296,7 @@ class Part:
                         self.batch.reset(ids=error.ids)
                     if live is not None:
                         link = self.qpos[:, self.model.qpos], self.qvel[:, dofs]
-                        live.moved(link, self.qpos[:, 3:7], self._bias(slice(None)))
+                        live.moved(link, self.qpos[:, 3:7])
         told = self.batch.warning[:, _WARNINGS, 1].sum(axis=1) - told
         lost = broken | (told > 0) | ~(np.abs(self.qvel).max(axis=1) < FASTEST)
         if lost.any():

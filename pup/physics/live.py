@@ -89,7 +89,6 @@ class LiveServos:
         self.servos.before = np.zeros((n, joints))
         self.steps = np.zeros((n, 1))
         self.position, self.velocity = np.zeros((n, joints)), np.zeros((n, joints))
-        self.bias = np.zeros((n, joints)) if self.servos.loaded else None
         self.joints, self.torso = self._history("delay", joints), self._history("tilt_delay", 4)
 
     def start(
@@ -99,7 +98,6 @@ class LiveServos:
         candidates: Candidates,
         link: tuple[Array, Array],
         torso: Array,
-        bias: Array | None,
     ) -> None:
         """Start some simulations anew.
 
@@ -109,7 +107,6 @@ class LiveServos:
           candidates: their parameters, k rows.
           link: positions (rad) and velocities (rad/s) of the joints, each (k, n_joints).
           torso: its orientation, shape (k, 4).
-          bias: torques of gravity and motion, shape (k, n_joints), N m; None where no term asks.
         """
         servos, scene = self.servos, outfit.scene
         position, velocity = link
@@ -129,8 +126,6 @@ class LiveServos:
         self.commands.renew(rows, np.asarray(scene.timestep))
         self.steps[rows] = 0
         self.position[rows], self.velocity[rows] = position, velocity
-        if self.bias is not None:
-            self.bias[rows] = bias
         for history, hook, now in (
             (self.joints, "delay", position),
             (self.torso, "tilt_delay", torso),
@@ -146,9 +141,9 @@ class LiveServos:
 
     def torque(self, link: tuple[Array, Array]) -> tuple[Array, Array]:
         """What reaches the links in one sub-step; see Servos.torque."""
-        return self.servos.torque(self.steps, link, (self.position, self.velocity), self.bias)
+        return self.servos.torque(self.steps, link, (self.position, self.velocity))
 
-    def moved(self, link: tuple[Array, Array], torso: Array, bias: Array | None) -> None:
+    def moved(self, link: tuple[Array, Array], torso: Array) -> None:
         """Take note of what a sub-step came to, as `start` does of the start."""
         self.steps += 1
         self.position[:], self.velocity[:] = self.servos.sense(*link)
@@ -156,8 +151,6 @@ class LiveServos:
             self.joints.push(self.position)
         if self.torso is not None:
             self.torso.push(torso)
-        if self.bias is not None:
-            self.bias[:] = bias
 
     def encoders(self, rows: Rows) -> Array:
         """Positions that are read of some simulations, shape (n_rows, n_joints), rad."""
@@ -207,8 +200,6 @@ class LiveServos:
             "held": self.commands.held,
             "told": self.commands.told,
         }
-        if self.bias is not None:
-            told["bias"] = self.bias
         for term in self.terms:
             told |= {f"{term.effect}/{name.strip('_')}": getattr(term, name) for name in term.state}
         return told

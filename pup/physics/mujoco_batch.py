@@ -250,7 +250,6 @@ class Run:
             wrenches = self.batch.bind("xfrc_applied")
             for term in pushing:
                 term.push(wrenches)
-        self.bias = self.batch.bind("qfrc_bias") if self.servos.loaded else None
         # Velocities stand half a sub-step before positions, see `simulator`.
         acceleration, bias = self.batch.bind("qacc"), self.batch.bind("qfrc_bias")
         model = self.group.model
@@ -347,8 +346,7 @@ class Run:
         """Apply what reaches the links in one sub-step; see Servos.torque."""
         qpos, dofs = self.group.model.qpos, self.group.model.dofs
         link = self.qpos[:n, qpos], self.qvel[:n, dofs]
-        bias = None if self.bias is None else self.bias[:n, dofs]
-        told = self.servos.torque(step, link, sensed, bias, still)
+        told = self.servos.torque(step, link, sensed, still)
         self.force[:n, dofs], self.damping[:n, dofs] = told
         if self.push is not None:
             self.push.add(self.force, step, n)

@@ -51,7 +51,7 @@ class Servos:
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self.before: Array | None = None
-        self.loaded = any(term.loaded for term in self.flowing)
+        self.freed = any(term.free for term in self.flowing)
 
     def begin(self) -> None:
         """Let the next sub-step be the first."""
@@ -69,7 +69,6 @@ class Servos:
         step: int | Array,
         link: tuple[Array, Array],
         sensed: tuple[Array, Array],
-        bias: Array | None,
         still: bool = False,
     ) -> tuple[Array, Array]:
         """What reaches the links in one sub-step.
@@ -78,7 +77,6 @@ class Servos:
           step: the sub-step; where simulations have one each, shape (n_simulations, 1).
           link: positions (rad) and velocities (rad/s) of the links, each (n_active, n_joints).
           sensed: the same as the encoders tell them.
-          bias: torques of gravity and motion, same shape, N m; None where no term asks for them.
           still: damp by the velocities that are, not by those at the sub-step's end.
 
         Returns:
@@ -95,16 +93,18 @@ class Servos:
             error = share * error + (1 - share) * old
             torque = share * torque + (1 - share) * was
             damping = share * damping + (1 - share) * damped
+        free = self.law.unlimited(error, sensed[1])[1] if self.freed else None
         if self.power is not None:
             on = np.repeat(self.power[step, :running], self.candidates)[:, None]
             torque *= on
             damping *= on
+            free = None if free is None else free * on
         if not still:
             self.limited.keep(sensed[1], torque, damping)
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
         if self.flowing:
-            return self._through_gears(time, link, sensed[1], bias, (torque, damping), still)
+            return self._through_gears(time, link, sensed[1], free, (torque, damping), still)
         damping = damping + self.viscous[: len(damping)]
         implicit = self._implicit(damping, still)
         if implicit is not None:
@@ -123,7 +123,7 @@ class Servos:
         time: float | Array,
         link: tuple[Array, Array],
         sensed: Array,
-        bias: Array | None,
+        free: Array | None,
         driven: tuple[Array, Array],
         still: bool,
     ) -> tuple[Array, Array]:
@@ -139,7 +139,7 @@ class Servos:
         now = link[1]
         before = now if self.before is None else self.before[: len(now)]
         self.before = now.copy()
-        flow = Flow(time, *link, 2 * now - before, bias, torque, damping, brake, viscous)
+        flow = Flow(time, *link, 2 * now - before, free, torque, damping, brake, viscous)
         for term in self.flowing:
             term.flow(flow)
         return flow.torque - flow.brake, flow.damping + flow.viscous

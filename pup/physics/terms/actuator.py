@@ -39,12 +39,16 @@ class TorqueSpeedLimit(Term):
 
 
 class ActuatorLag(Term):
-    """The torque follows what the law asks for with a time constant."""
+    """What drives the servo follows what the law asks for with a time constant.
+
+    The law's damping is the motor's own, back-EMF and grease, and does not wait.
+    """
 
     effect = "actuator_lag"
     quantities = (Quantity("time", "s", 0.008, 0.06),)
     source = "estimate: 5 to 15 ms of current loop and filters"
-    state = ("_lagging", "_torque", "_damping")
+    free = True
+    state = ("_lagging", "_asked")
 
     def prepare(self) -> None:
         """See Term."""
@@ -52,20 +56,18 @@ class ActuatorLag(Term):
         self._kept = np.exp(-steps)
         self._share = 1 - (1 - self._kept) / steps
         self._lagging = np.full_like(steps, np.nan)
-        self._torque, self._damping = np.zeros_like(steps), np.zeros_like(steps)
+        self._asked = np.zeros_like(steps)
 
     def flow(self, flow: Flow) -> None:
         """See Term: what is applied is the mean over the sub-step."""
+        assert flow.free is not None
         n = len(flow.torque)
-        torque, damping, lagging = self._torque[:n], self._damping[:n], self._lagging[:n]
-        # What the last sub-step came to, by the velocity at its end.
-        asked = torque - damping * flow.velocity
+        asked, lagging = self._asked[:n], self._lagging[:n]
         lagging[:] = asked + self._kept[:n] * (lagging - asked)
-        begin(lagging, flow.torque - flow.damping * flow.velocity)
-        torque[:], damping[:] = flow.torque, flow.damping
-        active, share = self.values["time"][:n] > 0, self._share[:n]
-        np.copyto(flow.torque, lagging + share * (torque - lagging), where=active)
-        np.copyto(flow.damping, share * damping, where=active)
+        asked[:] = flow.carried() + flow.free * flow.halfway
+        begin(lagging, asked)
+        behind = (1 - self._share[:n]) * (lagging - asked)
+        flow.torque += np.where(self.values["time"][:n] > 0, behind, 0.0)
 
 
 class VoltageSag(Term):

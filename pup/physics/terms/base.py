@@ -124,8 +124,7 @@ class Flow:
       position: of the link, rad.
       velocity: of the link, rad/s.
       coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
-      bias: torque of gravity and motion that the joint holds against, N m; only where a term asks
-        for it.
+      free: the law's damping as it is off the torque limit, N m s/rad; only where a term asks.
       torque: applied as it is, N m.
       damping: applied times the velocity at the sub-step's end, N m s/rad.
       brake: against the torque, by damping outside the servo, N m.
@@ -136,7 +135,7 @@ class Flow:
     position: Array
     velocity: Array
     coming: Array
-    bias: Array | None
+    free: Array | None
     torque: Array
     damping: Array
     brake: Array
@@ -144,7 +143,12 @@ class Flow:
 
     def carried(self) -> Array:
         """The torque halfway through the sub-step, N m."""
-        return self.torque - self.damping * (self.velocity + self.coming) / 2
+        return self.torque - self.damping * self.halfway
+
+    @property
+    def halfway(self) -> Array:
+        """The velocity halfway through the sub-step, rad/s."""
+        return (self.velocity + self.coming) / 2
 
 
 class Term:
@@ -157,7 +161,7 @@ class Term:
       source: where the typical sizes come from.
       layout: what the columns of the values are: the joints, the joints that carry a body, the
         model's bodies, the feet and the floor, or one for all.
-      loaded: whether it needs `Flow.bias`.
+      free: whether it needs `Flow.free`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
 
@@ -171,7 +175,7 @@ class Term:
     quantities: ClassVar[tuple[Quantity, ...]]
     source: ClassVar[str]
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
-    loaded: ClassVar[bool] = False
+    free: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, values: Mapping[str, Array], scene: Scene) -> None:

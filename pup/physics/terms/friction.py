@@ -99,18 +99,18 @@ class PreslidingHysteresis(Friction):
 
 
 class LoadDependentFriction(Friction):
-    """Friction that grows with what the gear carries: motor against gravity and motion."""
+    """Friction that grows with what the gear carries: the motor's torque and what it passes on."""
 
     effect = "load_dependent_friction"
     quantities = (Quantity("share", "1", 0.15, 0.8),)
     source = "BAM M4 to M6 (arXiv:2410.08650): 0.22 to 0.31 on MX-64 and MX-106"
-    loaded = True
 
     def level(self, flow: Flow) -> Array:
-        """See Friction."""
-        assert flow.bias is not None
-        load = np.abs(flow.carried() + flow.bias)
-        return self.values["share"][: len(load)] * load
+        """See Friction: what the gear passes on is the motor's torque less what turns its rotor."""
+        n, motor = len(flow.torque), flow.carried()
+        acceleration = (flow.coming - flow.velocity) / self.scene.timestep
+        passed = motor - self.scene.armature[:n] * acceleration
+        return np.asarray(self.values["share"][:n] * np.abs(motor + passed))
 
 
 class GearEfficiency(Friction):
