@@ -141,12 +141,9 @@ def lagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
 
 
 def sagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
-    q, v = x
-    left = 1.0
-    for _ in range(30):  # the torque sags by itself
-        torque = np.clip(KP * left * (target - q) - KD * v, -LIMIT * left, LIMIT * left)
-        left = 1 / (1 + 0.1 * abs(torque))
-    return torque + weight(q), ()
+    q, v, left = x
+    torque = np.clip(KP * left * (target - q) - KD * v, -LIMIT * left, LIMIT * left)
+    return torque + weight(q), [(1 / (1 + 0.1 * abs(torque)) - left) / 0.02]
 
 
 def biased(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
@@ -218,7 +215,7 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "load_dependent_friction": ({"share": 0.15}, by_load, (0.0,), INERTIA, 1e-3),
     "gear_efficiency": ({"loss": 0.2}, lossy, (0.0,), INERTIA, 1e-3),
     "actuator_lag": ({"time": 0.008}, lagging, (FIRST,), INERTIA, 2e-4),
-    "voltage_sag": ({"drop": 0.1}, sagging, (), INERTIA, 5e-4),
+    "voltage_sag": ({"drop": 0.1}, sagging, (1.0,), INERTIA, 5e-4),
     "armature": ({"inertia": 0.002}, plain, (), INERTIA + 0.002, 1e-4),
     "payload": ({"mass": 0.1}, heavier, (), INERTIA + 0.1 * 0.01, 1e-4),
     "external_force": ({"x": 1.0, "z": 0.5}, blown, (), INERTIA, 1e-4),

@@ -14,7 +14,7 @@ EQUATIONS = {
     "command_delay": "target(t) = command(t - d)",
     "measurement_delay": "reading(t) = q(t - d)",
     "actuator_lag": "dtau/dt = (tau_m - tau)/T",
-    "voltage_sag": "tau_m, tau_max: times 1/(1 + c sum |tau|)",
+    "voltage_sag": "tau_m, tau_max: times s; T ds/dt = 1/(1 + c sum |tau|) - s",
     "thermal_drift": "tau_m, tau_max: times (1 - r t)",
     "cogging": "tau += a sin(N q) + b cos(N q)",
     "backlash": "tau = 0 while |q_m - q| < b",

@@ -71,17 +71,24 @@ class ActuatorLag(Term):
 
 
 class VoltageSag(Term):
-    """Gains and limits of all servos fall with the torque that all of them give together."""
+    """Gains and limits of all servos fall with the torque that all of them give together.
+
+    What the supply's capacitors hold makes up for it at first.
+    """
 
     effect = "voltage_sag"
     kinds = ("bus",)
-    quantities = (Quantity("drop", "1/(N m)", 0.03, 0.5),)
-    source = "estimate: 5 to 15 % under the load of several joints"
+    quantities = (
+        Quantity("drop", "1/(N m)", 0.03, 0.5),
+        Quantity("buffer", "s", 0.02, 0.2, grid=(0.003, 0.02, 0.08)),
+    )
+    source = "estimate: 5 to 15 % under the load of several joints; 1 to 5 mF behind some ohms"
     state = ("_left",)
 
     def prepare(self) -> None:
         """See Term."""
         self._left = np.ones_like(self.values["drop"])
+        self._kept = np.exp(-self.scene.timestep / self.values["buffer"])
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
@@ -94,7 +101,8 @@ class VoltageSag(Term):
         """See Term."""
         n = len(torque)
         load = self.values["drop"][:n] * np.abs(torque).sum(axis=1, keepdims=True)
-        self._left[:n] = 1 / (1 + load)  # the supply's own resistance also limits what it gives
+        goal = 1 / (1 + load)  # the supply's own resistance also limits what it gives
+        self._left[:n] = goal + self._kept[:n] * (self._left[:n] - goal)
 
 
 class ThermalDrift(Term):
