@@ -34,8 +34,8 @@ FINALISTS = 8
 """Hypotheses refitted in each round."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
-FIRST, ROUGH = 2, 5
-"""Steps after which finalists are compared for the first time, and in which they are."""
+FIRST, ROUGH, LAST = 2, 5, 14
+"""Steps of all finalists before they are compared, of those that are promising then, of the best."""
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
@@ -228,7 +228,7 @@ class Selector:
             options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
         ]
         start_best([f for _, f in tried], places, self.replays, self.noise)
-        self._refit([fit for _, fit in tried], fit.chi2)
+        self._refit(tried, fit.chi2)
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
             return Round(model, tuple(ranking), (), 0)
@@ -256,17 +256,23 @@ class Selector:
         """Chi-squared that wrong forms of a model's effects may leave."""
         return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
 
-    def _refit(self, fits: Sequence[Fit], start: float) -> None:
-        """Refit finalists: all for a first look, the promising roughly, the best to the end."""
+    def _refit(self, tried: Sequence[tuple[tuple[Hypothesis, ...], Fit]], start: float) -> None:
+        """Refit finalists: all for a first look, the promising roughly, the best to the end.
+
+        So are those of the best one's class: what tells them apart is small.
+        """
+        fits = [fit for _, fit in tried]
         fit_together(fits, self.replays, self.noise, iterations=FIRST)
         seen = min(fit.chi2 for fit in fits)
         promising = [fit for fit in fits if fit.chi2 - seen < HOPE * (start - seen) + MARGIN]
         fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
         best = sorted(fits, key=lambda fit: fit.chi2)[:CLOSE]
-        close = [fit for fit in best if fit.chi2 < 1.02 * best[0].chi2 + MARGIN]
+        family = {h[-1].family for h, fit in tried if fit is best[0]}
+        near = [fit for fit in best if fit.chi2 < 1.02 * best[0].chi2 + MARGIN]
+        close = [fit for h, fit in tried if h[-1].family in family or any(fit is n for n in near)]
         for fit in close:
             fit.thorough, fit.done, fit.jacobian = True, False, None
-        fit_together(close, self.replays, self.noise, iterations=6)
+        fit_together(close, self.replays, self.noise, iterations=LAST)
 
     def _holds(self, before: Model, after: Model) -> bool:
         """Whether an effect keeps its gain where it was not fitted, and matters."""
@@ -386,10 +392,19 @@ def _material(
 
 
 def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
-    """The best score of each effect and place, as long as it promises enough."""
+    """The best score of each effect and place, as long as it promises enough.
+
+    Effects of the best one's class are all looked at where it acts: a nominal fit may have made
+    up for one of them to first order, as damping does for a lag, so that its slope says nothing.
+    """
     least = max(enough, WORTH * ranking[0].surprise)
     best: dict[object, Score] = {}
     for score in ranking:
         if score.surprise >= least and len(best) < FINALISTS:
             best.setdefault(score.trace.hypothesis.key, score)
+    first = ranking[0].trace.hypothesis
+    for score in ranking:
+        other = score.trace.hypothesis
+        if other.place == first.place and other.family == first.family:
+            best.setdefault(other.key, score)
     return list(best.values())
