@@ -35,7 +35,7 @@ FINALISTS = 8
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
 FIRST, ROUGH, LAST = 2, 5, 14
-"""Steps of all finalists before they are compared, of those that are promising then, of the best."""
+"""Steps of all finalists until they are compared, of those promising then, and of the best."""
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
