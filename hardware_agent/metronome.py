@@ -80,7 +80,7 @@ class Metronome:
         return self._time if self.lockstep else time.monotonic()
 
     def pace(self, paced: bool) -> None:
-        """Whether ticks of a lock-step robot keep to the clock: they do while nothing happens."""
+        """Whether ticks of a lock-step robot keep to the clock: when nothing waits for them."""
         if self.lockstep and paced != self.paced:
             self.paced = paced
             self._origin, self._beat = time.monotonic(), 0

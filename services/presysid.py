@@ -31,7 +31,7 @@ Progress = Callable[[str, Sequence[Status]], None]
 
 NEAR_SIGMA = 0.05
 """First step of a subset's fit around the nominal point, as the authors' code has it, and of a
-nominal fit that begins at another robot's."""
+nominal fit that begins at one made before."""
 FAR_SIGMA = 0.25
 """First step of a nominal fit that begins at a description's values."""
 
@@ -120,12 +120,22 @@ class _Job:
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
         compared: tuple[Actuator, ...] = (robot.actuator, "pd") if options.compare else ()
         self.actuators = tuple(dict.fromkeys((options.actuator, *compared)))
-        self.known: dict[Actuator, ParameterSpace] = {}
-        if options.start is not None:
-            kind, space = read_fitted(options.start, robot)
-            if kind not in self.actuators:
-                raise InputError(f"{options.start}: of the {kind} torque law, which is not fitted")
-            self.known[kind] = space
+        self.told = options.told()  # now: the file may change
+        self.known = {} if options.start is None else self._begin(options.start)
+
+    def _begin(self, start: Path) -> dict[Actuator, ParameterSpace]:
+        """The fitted values of another job, by its torque law."""
+        if start.resolve().is_relative_to(self.out.resolve()):
+            raise InputError(f"{start}: lies in the folder that is written to; copy it elsewhere")
+        kind, space = read_fitted(start, self.robot)
+        if kind not in self.actuators:
+            raise InputError(f"{start}: of the {kind} torque law, which is not fitted")
+        ends = zip(space.names, space.nominal, space.lower, space.upper, strict=True)
+        for name, value, low, high in ends:
+            if not low <= value <= high:
+                searched = f"its search range {low:g} to {high:g}"
+                raise InputError(f"{start}: parameter {name!r} is {value:g}, outside {searched}")
+        return {kind: space}
 
     def run(self) -> Bounds:
         begin = time.time()
@@ -297,7 +307,7 @@ class _Job:
     def _provenance(self, seconds: float) -> dict[str, Any]:
         packages = ("pup", "mujoco", "nevergrad", "numpy")
         return {
-            "options": self.options.told(),
+            "options": self.told,
             "robot_digest": self.robot.digest,
             "recordings": {r.id: r.digest for r in self.recordings},
             "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
@@ -328,7 +338,7 @@ def _subset_fit(problem: Problem, fit: FitResult, names: Sequence[str]) -> Subse
 
 
 def _measured(problem: Problem, fit: FitResult) -> dict[str, float]:
-    """Loss and RMSE (rad) over all recordings, at the robot's nominal values and after the fit."""
+    """Loss and RMSE (rad) over all recordings, where the fit begins and where it ends."""
     before = problem.free_space.normalise(problem.free_space.nominal)
     replayed = problem.replay(np.stack([before, fit.best]))
     losses = problem.loss.total(problem.loss.terms(replayed))

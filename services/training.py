@@ -27,6 +27,7 @@ from pup.policy.mirror import MirrorMap
 from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
+from pup.sysid.problem import MODEL
 from pup.sysid.result import read_bounds
 from services.checkpoint import Checkpoint
 from services.curve import draw_curve
@@ -338,6 +339,7 @@ class _Job:
         for name, value in (self.first or {}).items():
             first.update(name.encode() + value.tobytes())
         parts = (
+            str(MODEL),
             self.robot.digest,
             self.bounds_sha256,
             repr(self.settings),

@@ -259,8 +259,13 @@ def test_refuses_a_start_that_is_none(place: Place, identified: Path) -> None:
     known = shutil.copy(identified / "bounds.json", place.here / "known.json")
     other = RobotDescription.load("darwin_op2").identified_path
     law = "nn_pd" if json.loads(known.read_text())["actuator"]["kind"] == "pd" else "pd"
+    far = json.loads(known.read_text())
+    parameter = far["parameters"][0]
+    parameter["nominal"] = 2 * parameter["search"][1]
+    beyond = place.write("far.json", json.dumps(far))
     for options, words in (
         (("--start", place.here / "none.json"), ("none.json",)),
+        (("--start", beyond), (beyond, parameter["name"], "outside its search range")),
         (("--start", other), (other, "darwin_op2", "servo_bench")),
         (("--start", known, "--actuator", law), (known, "torque law", "not fitted")),
     ):

@@ -18,6 +18,7 @@ from terms import (
     play,
     ramp,
     sizes,
+    solved,
     steps,
 )
 from test_simulator import recording
@@ -352,3 +353,22 @@ def test_a_clock_that_goes_slow_meets_commands_early_and_ever_more_so() -> None:
     assert skewed == pytest.approx(early[where[: len(time)]], abs=1e-4)
     moved = np.abs(skewed - plain)
     assert moved[time > 7].max() > 3 * moved[time < 2].max()
+
+
+@pytest.mark.parametrize("time", [0.004, 0.008, 0.03])
+def test_a_lag_behind_a_stiff_law_at_its_limit_moves_as_its_equation_says(time: float) -> None:
+    """Its damping stops the joint within a sub-step, and goes on doing so at the torque limit."""
+    kp, kd, limit, rotor = 20.0, 0.5, 1.2, 3e-4
+    run = held(3.0, 0.6, 0.0, setup=LIGHT)
+    own = {"kp/servo": kp, "kd/servo": kd, "tau_max/servo": limit, "armature": rotor}
+    read = play(BENCH, run, [own | {f"actuator_lag/time{AT}": time}]).position[0, :, 0]
+
+    def lagging(t: float, x: Array, target: float) -> tuple[float, list[float]]:
+        q, v, driven = x
+        asked = np.clip(kp * (target - q) - kd * v, -limit, limit) + kd * v
+        return driven - kd * v, [(asked - driven) / time]
+
+    known = solved(run, lagging, limit, inertia=rotor + 1e-7)
+    before = known < 2.5  # then the joint's own end holds it
+    assert np.isfinite(read).all() and before.sum() > 4
+    assert np.abs(read - known)[before].max() < 0.05

@@ -33,6 +33,9 @@ FEWEST = 60
 """Samples below which nothing can be said."""
 MOTION = 0.02
 """A joint that never moves by as much shows nothing, rad."""
+ALONE = 0.5
+"""Mean square of a channel's errors beyond its noise, in that of the noise, from which something
+that has no name is told though no law of it predicts motions left out."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +149,15 @@ def diagnose(
     progress("what is left", 0.8)
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
+    shown = held_out(measured, selector.nominal, final, seed)
+    if left and not model.hypotheses and not _convinces(left, shown):
+        left, final = None, selector.predicting(model)
+        shown = held_out(measured, selector.nominal, final, seed)
     evidence: dict[str, Any] = {
         "found": done.found,
         "enough": done.enough,
         "rounds": rounds,
-        "held_out": held_out(measured, selector.nominal, final, seed),
+        "held_out": shown,
         "before": selector.nominal,
         "model": final,
         "unexplained": left,
@@ -170,6 +177,11 @@ def diagnose(
     every = (*named, left.finding) if left else named
     evidence["findings"] = tuple(sorted(every, key=lambda finding: -finding.gain))
     return told("mismatch", ask=ask, **evidence)
+
+
+def _convinces(left: Unexplained, shown: HeldOut) -> bool:
+    """Whether something unknown alone makes a mismatch: it is large, or its law predicts."""
+    return shown.interval[0] > 0 or max(lack.excess for lack in left.lacks) > ALONE
 
 
 def _first_look(

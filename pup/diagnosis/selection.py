@@ -31,7 +31,7 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 
 FINALISTS = 8
-"""Hypotheses refitted in each round."""
+"""Hypotheses refitted in each round, beside those of the best one's class."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
 FIRST, ROUGH, LAST = 2, 5, 14
@@ -222,7 +222,7 @@ class Selector:
         ranking = scores(project_again(rest, project), project(fit.residual[:, None])[:, 0])
         if not ranking or ranking[0].surprise < self.enough:
             return None
-        shortlist = _shortlist(ranking, self.enough)
+        shortlist = _shortlist(ranking, self.enough, self.replays.measured.robot)
         tried = [self._started(model, score) for score in shortlist]
         places = [
             options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
@@ -391,7 +391,7 @@ def _material(
     return bool((explained > MATERIAL**2 * np.bincount(channel)).any())
 
 
-def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
+def _shortlist(ranking: Sequence[Score], enough: float, robot: RobotDescription) -> list[Score]:
     """The best score of each effect and place, as long as it promises enough.
 
     Effects of the best one's class are all looked at where it acts: a nominal fit may have made
@@ -403,8 +403,9 @@ def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
         if score.surprise >= least and len(best) < FINALISTS:
             best.setdefault(score.trace.hypothesis.key, score)
     first = ranking[0].trace.hypothesis
+    joints = list(first.place.joints(robot))
     for score in ranking:
         other = score.trace.hypothesis
-        if other.place == first.place and other.family == first.family:
+        if other.family == first.family and list(other.place.joints(robot)) == joints:
             best.setdefault(other.key, score)
     return list(best.values())

@@ -311,7 +311,7 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
         f"Readings of {f.at} are {f.speech.quantity(f.size['time'], 's')} old."
     ),
     "actuator_lag": lambda f: (
-        f"The torque of {f.at} lags {f.speech.quantity(f.size['time'], 's')} behind what the "
+        f"What drives {f.at} lags {f.speech.quantity(f.size['time'], 's')} behind what the "
         "controller asks for."
     ),
     "voltage_sag": _sag,

@@ -258,7 +258,8 @@ def _walk(table: Table, file: Path) -> Walk:
 
 
 def _part(table: Table, usual: Any) -> Any:
-    read = _values(table, usual, tuple(f.name for f in fields(usual)))
+    # A plan is text that means the same everywhere: it names no files.
+    read = _values(table, usual, tuple(f.name for f in fields(usual) if f.name != "start"))
     table.close()
     return replace(usual, **read)
 

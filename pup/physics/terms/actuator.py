@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics.implicit import implicit_share
 from pup.physics.terms.base import Drive, Flow, Quantity, Term, begin
 
 Array = NDArray[np.float64]
@@ -48,7 +49,7 @@ class ActuatorLag(Term):
     quantities = (Quantity("time", "s", 0.008, 0.06),)
     source = "estimate: 5 to 15 ms of current loop and filters"
     free = True
-    state = ("_lagging", "_asked")
+    state = ("_lagging", "_asked", "_ahead")
 
     def prepare(self) -> None:
         """See Term."""
@@ -56,18 +57,26 @@ class ActuatorLag(Term):
         self._kept = np.exp(-steps)
         self._share = 1 - (1 - self._kept) / steps
         self._lagging = np.full_like(steps, np.nan)
-        self._asked = np.zeros_like(steps)
+        self._asked, self._ahead = np.zeros_like(steps), np.zeros_like(steps)
 
     def flow(self, flow: Flow) -> None:
-        """See Term: what is applied is the mean over the sub-step."""
+        """See Term: what is applied is the mean over the sub-step.
+
+        A part of it is what is asked for now, the rest what was, less the damping that is now.
+        """
         assert flow.free is not None
         n = len(flow.torque)
-        asked, lagging = self._asked[:n], self._lagging[:n]
+        lagging, before, ahead = self._lagging[:n], self._asked[:n], self._ahead[:n]
+        asked = before + ahead * flow.velocity  # by the velocity that the last sub-step came to
         lagging[:] = asked + self._kept[:n] * (lagging - asked)
-        asked[:] = flow.carried() + flow.free * flow.halfway
-        begin(lagging, asked)
-        behind = (1 - self._share[:n]) * (lagging - asked)
-        flow.torque += np.where(self.values["time"][:n] > 0, behind, 0.0)
+        implicit = implicit_share(flow.free, self.scene.inertia[:n], self.scene.timestep)
+        own = (1 - implicit) * flow.free * flow.velocity
+        before[:], ahead[:] = flow.torque + own, implicit * flow.free - flow.damping
+        # It stood; velocities begin half a sub-step before, which a limit does not see.
+        begin(lagging, np.where(flow.damping > 0, before, flow.torque))
+        now = np.where(self.values["time"][:n] > 0, self._share[:n], 1.0)
+        flow.torque[:] = now * flow.torque + (1 - now) * (lagging - own)
+        flow.damping[:] = now * flow.damping + (1 - now) * implicit * flow.free
 
 
 class VoltageSag(Term):
