@@ -222,7 +222,7 @@ class Selector:
         ranking = scores(project_again(rest, project), project(fit.residual[:, None])[:, 0])
         if not ranking or ranking[0].surprise < self.enough:
             return None
-        shortlist = _shortlist(ranking, self.enough, self.replays.measured.robot)
+        shortlist = _shortlist(ranking, self.enough)
         tried = [self._started(model, score) for score in shortlist]
         places = [
             options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
@@ -403,9 +403,9 @@ def _shortlist(ranking: Sequence[Score], enough: float, robot: RobotDescription)
         if score.surprise >= least and len(best) < FINALISTS:
             best.setdefault(score.trace.hypothesis.key, score)
     first = ranking[0].trace.hypothesis
-    joints = list(first.place.joints(robot))
     for score in ranking:
         other = score.trace.hypothesis
-        if other.family == first.family and list(other.place.joints(robot)) == joints:
+        whole = {other.place.kind, first.place.kind} == {"robot", "bus"}
+        if other.family == first.family and (whole or other.place == first.place):
             best.setdefault(other.key, score)
     return list(best.values())
