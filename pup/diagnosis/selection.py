@@ -391,7 +391,7 @@ def _material(
     return bool((explained > MATERIAL**2 * np.bincount(channel)).any())
 
 
-def _shortlist(ranking: Sequence[Score], enough: float, robot: RobotDescription) -> list[Score]:
+def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
     """The best score of each effect and place, as long as it promises enough.
 
     Effects of the best one's class are all looked at where it acts: a nominal fit may have made
