@@ -12,7 +12,7 @@ from pup.physics.parameters import ParameterSpace, robot_space
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid.excitation import script
-from pup.sysid.gauss_newton import Residuals, confidence, least_squares
+from pup.sysid.gauss_newton import Residuals, confidence, least_point, least_squares
 from pup.sysid.problem import Problem
 
 Array = NDArray[np.float64]
@@ -54,6 +54,25 @@ def test_a_linear_problem_is_solved_with_its_walls(seed: int) -> None:
     assert fit.best == pytest.approx(known.x, abs=2e-4)
     assert fit.cost == pytest.approx(known.cost, rel=1e-6)
     assert ((fit.best >= 0) & (fit.best <= 1)).all()
+
+
+@pytest.mark.parametrize("anchored", [False, True])
+def test_the_least_point_is_the_same_without_its_covariance(anchored: bool) -> None:
+    rng = np.random.default_rng(7)
+    matrix = rng.normal(size=(40, 4))
+    problem, start = linear(matrix, matrix @ rng.uniform(size=4)), np.full(4, 0.5)
+    asked: list[int] = []
+
+    def counted(unit: Array) -> Array:
+        asked.append(len(unit))
+        return problem(unit)
+
+    anchor = np.full(4, 0.2) if anchored else None
+    prior = {"prior_mean": anchor, "prior_sd": np.full(4, 0.3)} if anchored else {}
+    whole = least_squares(problem, start, iterations=5, step=0.002, **prior)
+    point = least_point(counted, start, anchor, 0.3, iterations=5, step=0.002)
+    np.testing.assert_array_equal(point, whole.best)
+    assert sum(asked) == whole.replays - len(start)
 
 
 @pytest.mark.parametrize("seed", range(4))
