@@ -97,7 +97,7 @@ class VoltageSag(Term):
     def prepare(self) -> None:
         """See Term."""
         self._left = np.ones_like(self.values["drop"])
-        self._kept = np.exp(-self.scene.timestep / self.values["buffer"])
+        self._kept = np.exp(-self.scene.timestep / np.maximum(self.values["buffer"], 1e-9))
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
