@@ -70,7 +70,9 @@ class Options:
 
     def told(self) -> dict[str, Any]:
         """As files have it: a file is known by its content, wherever it lies."""
-        return asdict(self) | {"start": self.start and sha256(self.start)}
+        told = asdict(self)
+        del told["start"]
+        return told if self.start is None else told | {"start": sha256(self.start)}
 
 
 def identify(

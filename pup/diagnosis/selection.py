@@ -266,10 +266,14 @@ class Selector:
         seen = min(fit.chi2 for fit in fits)
         promising = [fit for fit in fits if fit.chi2 - seen < HOPE * (start - seen) + MARGIN]
         fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
-        best = sorted(fits, key=lambda fit: fit.chi2)[:CLOSE]
-        family = {h[-1].family for h, fit in tried if fit is best[0]}
-        near = [fit for fit in best if fit.chi2 < 1.02 * best[0].chi2 + MARGIN]
-        close = [fit for h, fit in tried if h[-1].family in family or any(fit is n for n in near)]
+        ranked = sorted(tried, key=lambda one: one[1].chi2)
+        family, least = ranked[0][0][-1].family, ranked[0][1].chi2
+        close = [
+            fit
+            for rank, (hypotheses, fit) in enumerate(ranked)
+            if hypotheses[-1].family == family
+            or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
+        ]
         for fit in close:
             fit.thorough, fit.done, fit.jacobian = True, False, None
         fit_together(close, self.replays, self.noise, iterations=LAST)

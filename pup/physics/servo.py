@@ -51,7 +51,7 @@ class Servos:
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self.before: Array | None = None
-        self.freed = any(term.free for term in self.flowing)
+        self.needs_law_damping = any(term.needs_law_damping for term in self.flowing)
 
     def begin(self) -> None:
         """Let the next sub-step be the first."""
@@ -93,18 +93,18 @@ class Servos:
             error = share * error + (1 - share) * old
             torque = share * torque + (1 - share) * was
             damping = share * damping + (1 - share) * damped
-        free = self.law.unlimited(error, sensed[1])[1] if self.freed else None
+        own = self.law.unlimited(error, sensed[1])[1] if self.needs_law_damping else None
         if self.power is not None:
             on = np.repeat(self.power[step, :running], self.candidates)[:, None]
             torque *= on
             damping *= on
-            free = None if free is None else free * on
+            own = None if own is None else own * on
         if not still:
             self.limited.keep(sensed[1], torque, damping)
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
         if self.flowing:
-            return self._through_gears(time, link, sensed[1], free, (torque, damping), still)
+            return self._through_gears(time, link, sensed[1], own, (torque, damping), still)
         damping = damping + self.viscous[: len(damping)]
         implicit = self._implicit(damping, still)
         if implicit is not None:
@@ -123,7 +123,7 @@ class Servos:
         time: float | Array,
         link: tuple[Array, Array],
         sensed: Array,
-        free: Array | None,
+        law_damping: Array | None,
         driven: tuple[Array, Array],
         still: bool,
     ) -> tuple[Array, Array]:
@@ -139,7 +139,8 @@ class Servos:
         now = link[1]
         before = now if self.before is None else self.before[: len(now)]
         self.before = now.copy()
-        flow = Flow(time, *link, 2 * now - before, free, torque, damping, brake, viscous)
+        coming = 2 * now - before
+        flow = Flow(time, *link, coming, law_damping, torque, damping, brake, viscous)
         for term in self.flowing:
             term.flow(flow)
         return flow.torque - flow.brake, flow.damping + flow.viscous

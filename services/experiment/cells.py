@@ -127,7 +127,7 @@ class _Graph:
         self._add(Cell(name, "presysid", dict(needs), told, self._given(), weight))
 
     def _fitted(self, fits: Fits) -> dict[str, Any]:
-        return self._told(fits=_told(fits), motions=self.plan.record.fitted)
+        return self._told(fits=fits.told(), motions=self.plan.record.fitted)
 
     def _policy(self, walk: Walk, method: Method) -> None:
         name, train = f"policy-{walk.direction}-{method}", self.plan.train
@@ -212,14 +212,7 @@ class _Graph:
             raise InputError(f"{folder}: no *.parquet in this folder; see `pup import`")
         told = {"recordings": {file.name: sha256(file) for file in files}}
         given = self._given(recordings=str(folder.absolute()))
-        fits = _told(self.plan.fleet) | {"compare": True}
+        fits = self.plan.fleet.told() | {"compare": True}
         self._add(Cell("presysid-real", "presysid", {}, self._told(fits=fits, **told), given, 1e5))
         plan = asdict(self.plan.diagnosis) | {"rivals": True, "rollouts": 0, "motions": ()}
         self._add(Cell("diagnosis-real", "diagnosis", {}, self._told(**plan, **told), given, 1e5))
-
-
-def _told(fits: Fits) -> dict[str, Any]:
-    """A budget of fits as cells have it: without the start that no plan gives."""
-    told = asdict(fits)
-    del told["start"]
-    return told

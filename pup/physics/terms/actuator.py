@@ -48,7 +48,7 @@ class ActuatorLag(Term):
     effect = "actuator_lag"
     quantities = (Quantity("time", "s", 0.008, 0.06),)
     source = "estimate: 5 to 15 ms of current loop and filters"
-    free = True
+    needs_law_damping = True
     state = ("_lagging", "_asked", "_ahead")
 
     def prepare(self) -> None:
@@ -64,19 +64,19 @@ class ActuatorLag(Term):
 
         A part of it is what is asked for now, the rest what was, less the damping that is now.
         """
-        assert flow.free is not None
-        n = len(flow.torque)
+        assert flow.law_damping is not None
+        n, damping = len(flow.torque), flow.law_damping
         lagging, before, ahead = self._lagging[:n], self._asked[:n], self._ahead[:n]
         asked = before + ahead * flow.velocity  # by the velocity that the last sub-step came to
         lagging[:] = asked + self._kept[:n] * (lagging - asked)
-        implicit = implicit_share(flow.free, self.scene.inertia[:n], self.scene.timestep)
-        own = (1 - implicit) * flow.free * flow.velocity
-        before[:], ahead[:] = flow.torque + own, implicit * flow.free - flow.damping
+        implicit = implicit_share(damping, self.scene.inertia[:n], self.scene.timestep)
+        own = (1 - implicit) * damping * flow.velocity
+        before[:], ahead[:] = flow.torque + own, implicit * damping - flow.damping
         # It stood; velocities begin half a sub-step before, which a limit does not see.
         begin(lagging, np.where(flow.damping > 0, before, flow.torque))
         now = np.where(self.values["time"][:n] > 0, self._share[:n], 1.0)
         flow.torque[:] = now * flow.torque + (1 - now) * (lagging - own)
-        flow.damping[:] = now * flow.damping + (1 - now) * implicit * flow.free
+        flow.damping[:] = now * flow.damping + (1 - now) * implicit * damping
 
 
 class VoltageSag(Term):

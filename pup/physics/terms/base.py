@@ -124,7 +124,7 @@ class Flow:
       position: of the link, rad.
       velocity: of the link, rad/s.
       coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
-      free: the law's damping as it is off the torque limit, N m s/rad; only where a term asks.
+      law_damping: the law's damping off its torque limit, N m s/rad; only where a term asks.
       torque: applied as it is, N m.
       damping: applied times the velocity at the sub-step's end, N m s/rad.
       brake: against the torque, by damping outside the servo, N m.
@@ -135,7 +135,7 @@ class Flow:
     position: Array
     velocity: Array
     coming: Array
-    free: Array | None
+    law_damping: Array | None
     torque: Array
     damping: Array
     brake: Array
@@ -161,7 +161,7 @@ class Term:
       source: where the typical sizes come from.
       layout: what the columns of the values are: the joints, the joints that carry a body, the
         model's bodies, the feet and the floor, or one for all.
-      free: whether it needs `Flow.free`.
+      needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
 
@@ -175,7 +175,7 @@ class Term:
     quantities: ClassVar[tuple[Quantity, ...]]
     source: ClassVar[str]
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
-    free: ClassVar[bool] = False
+    needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, values: Mapping[str, Array], scene: Scene) -> None:
