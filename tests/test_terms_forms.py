@@ -181,12 +181,23 @@ def test_a_sagging_supply_weakens_all_joints_alike() -> None:
 
 
 def test_a_drifting_gain_sags_more_and_more() -> None:
-    """Kp (1 - rate t) e = m g l sin q, at a rate that the joint follows."""
+    """Kp (1 - rate h) e = m g l sin q with h = T (1 - exp(-t / T)), and the joint follows."""
     run = held(0.5, 20.0)
-    (read,) = bench(run, {f"thermal_drift/rate{AT}": 0.02})
+    (read,) = bench(run, {f"thermal_drift/rate{AT}": 0.02, f"thermal_drift/time{AT}": 30.0})
     for k in (500, -1):
-        left = KP * (1 - 0.02 * run.time[k]) * (0.5 - read[k])
+        lost = 0.02 * 30 * (1 - np.exp(-run.time[k] / 30))
+        left = KP * (1 - lost) * (0.5 - read[k])
         assert left == pytest.approx(LEVER * G * np.sin(read[k]), rel=3e-3)
+
+
+def test_a_winding_warms_by_what_it_carries() -> None:
+    """The same with dh/dt = |tau| / limit - h / T, where tau is what gravity asks for."""
+    run = held(0.5, 20.0)
+    terms = {"rate": 0.1, "time": 5.0, "load": 1.0}
+    (read,) = bench(run, {f"thermal_drift/{name}{AT}": value for name, value in terms.items()})
+    carried = LEVER * G * np.sin(read[-1])
+    left = KP * (1 - 0.1 * 5 * carried / LIMIT) * (0.5 - read[-1])
+    assert left == pytest.approx(carried, rel=5e-3)
 
 
 def test_an_asymmetric_gain_holds_one_side_stiffer() -> None:

@@ -53,7 +53,7 @@ def back_emf(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]
 
 
 def drifting(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
-    left = 1 - 0.05 * t
+    left = 1 - 0.05 * 40 * -np.expm1(-t / 40)
     torque = np.clip(KP * left * (target - x[0]) - KD * x[1], -LIMIT * left, LIMIT * left)
     return torque + weight(x[0]), ()
 
@@ -68,6 +68,21 @@ def integrating(t: float, x: Array, target: float) -> tuple[float, Sequence[floa
     asked = KP * (target - q) + 15 * total - KD * v
     wound = abs(asked) >= LIMIT and asked * (target - q) > 0
     return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if wound else target - q]
+
+
+def wound_up(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, total = x
+    most = LIMIT / 15
+    asked = KP * (target - q) + 15 * np.clip(total, -most, most) - KD * v
+    full = abs(total) >= most and total * (target - q) > 0
+    return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if full else target - q]
+
+
+def warming(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, warmth = x
+    left = 1 - 2 * warmth
+    torque = np.clip(left * (KP * (target - q) - KD * v), -LIMIT * left, LIMIT * left)
+    return torque + weight(q), [abs(torque) / LIMIT - warmth / 5]
 
 
 def kicked(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
@@ -185,6 +200,20 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "thermal_drift": ({"rate": 0.05}, drifting, (), INERTIA, 1e-4),
     "gain_asymmetry": ({"share": 0.2}, lopsided, (), INERTIA, 1e-4),
     "integral_action": ({"gain": 15.0}, integrating, (0.0,), INERTIA, 5e-4),
+    "integral_action, winding up": (
+        {"gain": 15.0, "windup": 1.0},
+        wound_up,
+        (0.0,),
+        INERTIA,
+        5e-4,
+    ),
+    "thermal_drift, by load": (
+        {"rate": 2.0, "load": 1.0, "time": 5.0},
+        warming,
+        (0.0,),
+        INERTIA,
+        2e-4,
+    ),
     "derivative_kick": (
         {"gain": 0.05, "time": 0.02},
         kicked,
@@ -219,7 +248,7 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "armature": ({"inertia": 0.002}, plain, (), INERTIA + 0.002, 1e-4),
     "payload": ({"mass": 0.1}, heavier, (), INERTIA + 0.1 * 0.01, 1e-4),
     "external_force": ({"x": 1.0, "z": 0.5}, blown, (), INERTIA, 1e-4),
-    "joint_compliance": ({"compliance": 0.02}, springy, (0.0, 0.0), LINK, 5e-4),
+    "joint_compliance": ({"compliance": 0.02}, springy, (0.0, 0.0), LINK, 7e-4),
 }
 PLACES = {"voltage_sag": "@bus", "payload": "@body:load", "external_force": "@body:load"}
 
@@ -228,8 +257,8 @@ PLACES = {"voltage_sag": "@bus", "payload": "@body:load", "external_force": "@bo
 def replayed() -> dict[str, Array]:
     """All cases in one batch: their rows are of no concern to each other."""
     rows = [
-        {f"{effect}/{name}{PLACES.get(effect, AT)}": v for name, v in values.items()}
-        for effect, (values, *_) in CASES.items()
+        {f"{case.split(',')[0]}/{name}{PLACES.get(case, AT)}": v for name, v in values.items()}
+        for case, (values, *_) in CASES.items()
     ]
     return dict(zip(CASES, bench(RUN, *rows), strict=True))
 

@@ -18,7 +18,7 @@ from pup.diagnosis.locate import BAND, MissingInput, explained_by
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import KEPT, Model, Selector
-from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter, doubt
+from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter, doubt, left_over
 from pup.physics.terms import Place
 from pup.physics.terms.learned import LearnedLaw, unit
 from pup.robot import TermSpec
@@ -33,8 +33,6 @@ MATERIAL = 0.09
 """Mean square of a channel's unexplained errors, in that of its noise, that matters."""
 FORM = 0.05
 """Share of its own trace that a wrong form of a known effect may leave."""
-UNSURE = {"repeats": 0.05, "assumed": 0.15}
-"""By what share the noise floor's variance may be wrong."""
 BLOCK = 0.5
 """Errors nearer than this in time are not taken for independent, s."""
 FEWEST = 40
@@ -105,10 +103,10 @@ def unexplained(
     assert fit.residual is not None
     answers = responses(fit, replays, selector.noise, budget)
     missing = explained_by(answers, fit)
-    lacks = lack_of_fit(measured, fit.residual, missing, UNSURE[selector.noise.source])
+    lacks = lack_of_fit(measured, fit.residual, missing, selector.noise.unsure)
     flagged = [lack for lack in lacks if _matters(lack, missing)]
-    excess = float(fit.residual @ fit.residual) - len(fit.residual)
-    if not flagged or excess < selector.blur(model, FORM):
+    left = left_over(model, selector.noise, measured)
+    if not flagged or left <= selector.blur(model, FORM):
         return None
     place, joints = _place(measured, missing, flagged)
     tried: list[Law] = []
@@ -143,7 +141,10 @@ def unexplained(
 
 def _probability(model: Model, selector: Selector) -> float:
     """That there is something without a name: sure alone, else by what named effects leave."""
-    return doubt(selector.nominal, model) if model.hypotheses else 1 - UNKNOWN
+    if not model.hypotheses:
+        return 1 - UNKNOWN
+    explained = selector.nominal.fit.chi2 - model.fit.chi2
+    return doubt(explained, model, selector.noise, selector.replays.measured)
 
 
 def lack_of_fit(

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pup.diagnosis.discover import Unexplained, unexplained
 from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
-from pup.diagnosis.fitting import differentiate
+from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.nominal import Nominal, fit_nominal
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
-from pup.diagnosis.residuals import Measured, Noise, assumed_noise
+from pup.diagnosis.residuals import Measured, Noise, assumed_noise, quiet_noise
 from pup.diagnosis.search import Search, followed, search
 from pup.diagnosis.selection import Model, Round, Selector
 from pup.diagnosis.splits import Split, splits
@@ -33,6 +33,10 @@ FEWEST = 60
 """Samples below which nothing can be said."""
 MOTION = 0.02
 """A joint that never moves by as much shows nothing, rad."""
+SAME_SIGMA, SAME_RHO = 0.1, 0.15
+"""Noise told anew that differs by less, as a share and in its memory, is what was assumed."""
+ASTRAY = 1.7
+"""Noise told anew that is larger by more is no noise: the model is wrong everywhere."""
 ALONE = 0.5
 """Mean square of a channel's errors beyond its noise, in that of the noise, from which something
 that has no name is told though no law of it predicts motions left out."""
@@ -143,6 +147,8 @@ def diagnose(
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
     done = search(replays, nominal, rng, progress, first[1] if first else None)
+    if done is not None and nominal.noise.source == "assumed":
+        nominal, done = _weighed(nominal, done, replays, rng, progress, first)
     if done is None:
         return told("undetermined", "the motions would not show any effect of the library")
     model, rounds, selector = done.model, done.rounds, done.selector
@@ -177,6 +183,35 @@ def diagnose(
     every = (*named, left.finding) if left else named
     evidence["findings"] = tuple(sorted(every, key=lambda finding: -finding.gain))
     return told("mismatch", ask=ask, **evidence)
+
+
+def _weighed(
+    nominal: Nominal,
+    done: Search,
+    replays: Replays,
+    rng: np.random.Generator,
+    progress: Progress,
+    first: tuple[Nominal, Search] | None,
+) -> tuple[Nominal, Search | None]:
+    """The search done again where what it leaves is not the noise that it was weighed by.
+
+    With nothing recorded twice, noise is first taken from how errors flicker at rest, of which
+    there may be little.
+    """
+    measured, before = replays.measured, nominal.noise
+    noise = quiet_noise(measured, measured.values - replays([done.model.fit.row()])[0])
+    larger = noise.sigma / before.sigma
+    same = np.abs(larger - 1) < SAME_SIGMA
+    if (same & (np.abs(noise.rho - before.rho) < SAME_RHO)).all() or larger.max() > ASTRAY:
+        return nominal, done
+    fit = Fit(nominal.fit.coordinates, nominal.fit.at)
+    fit_together([fit], replays, noise)
+    if fit.jacobian is None:
+        differentiate([fit], replays, noise)
+    certificate = nominal.certificate
+    left = certificate.left * fit.chi2 / nominal.fit.chi2
+    nominal = Nominal(fit, noise, replace(certificate, left=left))
+    return nominal, search(replays, nominal, rng, progress, first[1] if first else None)
 
 
 def _convinces(left: Unexplained, shown: HeldOut) -> bool:

@@ -15,7 +15,7 @@ EQUATIONS = {
     "measurement_delay": "reading(t) = q(t - d)",
     "actuator_lag": "tau = u - kd qdot, du/dt = (tau_m + kd qdot - u)/T",
     "voltage_sag": "tau_m, tau_max: times s; T ds/dt = 1/(1 + c sum |tau|) - s",
-    "thermal_drift": "tau_m, tau_max: times (1 - r t)",
+    "thermal_drift": "tau_m, tau_max: times 1 - r h, dh/dt = 1 - h/T; by load: |tau|/tau_max - h/T",
     "cogging": "tau += a sin(N q) + b cos(N q)",
     "backlash": "tau = 0 while |q_m - q| < b",
     "dead_band": "e -> e - clip(e, -w, w)",

@@ -208,7 +208,7 @@ class _Report:
         if diagnosis.rounds and diagnosis.rounds[-1].finalists:
             closest = diagnosis.rounds[-1]
             named = self.speech.words(closest.chosen.effect, closest.chosen.place)
-            yield f"Closest was {named}; {summary.why_rejected(closest)}."
+            yield f"Closest was {named}; {summary.why_rejected(closest, self.diagnosis)}."
         if diagnosis.noise.source == "assumed":
             yield (
                 "No motion was recorded twice, so the noise level is assumed from how readings "

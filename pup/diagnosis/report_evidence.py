@@ -93,15 +93,19 @@ def _ranking(
 
 def _refits(diagnosis: Diagnosis, speech: Speech, chosen: Round) -> Iterator[Html]:
     """The finalists after their refits, and why they fell behind."""
-    finalists = summary.rivals(chosen, diagnosis.model)
+    finalists = summary.rivals(chosen, diagnosis, diagnosis.model)
     if not finalists:
-        yield tag("p", f"{capital(summary.why_rejected(chosen))}.")
+        yield tag("p", f"{capital(summary.why_rejected(chosen, diagnosis))}.")
         return
     names = [_label(speech, r.score.trace.hypothesis) for r in finalists]
     best = finalists[0]
     inside = np.array([r.inside for r in finalists])
     outside = np.array([r.outside for r in finalists])
-    verdict = "was added" if chosen.accepted else f"was not added: {summary.why_rejected(chosen)}"
+    verdict = (
+        "was added"
+        if chosen.accepted
+        else f"was not added: {summary.why_rejected(chosen, diagnosis)}"
+    )
     takeaway = f"{capital(names[0])} explains most where it was not fitted, and {verdict}."
     if not np.isclose(outside[0], outside.max()):
         takeaway = f"{capital(names[0])} is best by fit, prediction and simplicity, and {verdict}."
@@ -161,7 +165,9 @@ def hiding(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
 
 def _masked(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     """How nominal parameters imitate the finalists."""
-    finalists = [r for chosen in diagnosis.rounds for r in summary.rivals(chosen, diagnosis.model)]
+    finalists = [
+        r for chosen in diagnosis.rounds for r in summary.rivals(chosen, diagnosis, diagnosis.model)
+    ]
     fit = diagnosis.nominal.fit
     traces = {t.hypothesis: t for t in diagnosis.found}
     told: dict[object, tuple[str, float, Array]] = {}

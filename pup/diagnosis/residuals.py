@@ -34,6 +34,14 @@ MEMORY = 0.85
 """Errors at rest with a longer memory from tick to tick are a drift, not noise."""
 NORMAL_CUT = 0.965
 """Mean square of a normal variable whose squares are cut at their 98 % quantile."""
+UNSURE = {"repeats": 0.05, "assumed": 0.15}
+"""By what share a noise floor's variance may be wrong, however many readings tell it."""
+BLOCK = 0.5
+"""Errors are looked at in blocks of this length to tell noise from what a model lacks, s."""
+FEWEST_BLOCKS = 8
+"""Blocks of a channel below which they tell nothing of its noise."""
+QUIET = 2.5
+"""Blocks with more than so many times the usual mean square are not noise alone."""
 LOST = 3.0
 """Error counted for a simulation that broke down, rad."""
 
@@ -46,11 +54,19 @@ class Noise:
       sigma: standard deviation of each channel, shape (n_channels,), rad.
       rho: its correlation from tick to tick, same shape.
       source: whether repeated recordings tell it or it is assumed.
+      readings: differences of repeats that tell a channel's; 0 where none do.
     """
 
     sigma: Array
     rho: Array
     source: Literal["repeats", "assumed"]
+    readings: int = 0
+
+    @property
+    def unsure(self) -> float:
+        """Standard deviation of the floor's variance, as a share of it."""
+        few = np.sqrt(2 / self.readings) if self.readings else 0.0
+        return float(np.hypot(UNSURE[self.source], few))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,22 +175,58 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
     """
     pairs = _repeats(measured)
     differences = [_difference(measured, errors, a, b) for a, b in pairs]
-    told = {}
+    told, readings = {}, []
     for channel in range(measured.channels):
         parts = [d[channel] for d in differences if channel in d]
         if parts:
             told[channel] = _spread(parts)
+            readings.append(sum(map(len, parts)))
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
     if not told:
         for channel in range(measured.channels):
             flicker = _flicker(measured, errors, channel)
             if flicker:
                 told[channel] = flicker
-    return _pooled(measured, told, source)
+    return _pooled(measured, told, source, int(np.median(readings)) if readings else 0)
+
+
+def quiet_noise(measured: Measured, errors: Array) -> Noise:
+    """Noise of the channels where nothing was repeated, from what a good model leaves.
+
+    Noise is everywhere alike; what a model still lacks shows in some motions and not in others.
+
+    Args:
+      measured: the samples.
+      errors: measured minus simulated, shape (n_samples,), rad.
+    """
+    told = {}
+    for channel in range(measured.channels):
+        blocks = _blocks(measured, errors, channel)
+        if len(blocks) < FEWEST_BLOCKS:
+            continue
+        squares = np.array([np.mean(block**2) for block in blocks])
+        kept = [b for b, s in zip(blocks, squares, strict=True) if s < QUIET * np.median(squares)]
+        variance = float(np.mean(np.concatenate(kept) ** 2))
+        follows = float(np.mean(np.concatenate([b[1:] * b[:-1] for b in kept])))
+        told[channel] = np.sqrt(variance), max(follows / max(variance, 1e-300), 0.0)
+    return _pooled(measured, told, "assumed", 0)
+
+
+def _blocks(measured: Measured, errors: Array, channel: int) -> list[Array]:
+    """Errors of a channel, in blocks of some time."""
+    told: list[Array] = []
+    for number in range(len(measured.recordings)):
+        own = (measured.recording == number) & (measured.channel == channel)
+        edges = np.flatnonzero(np.diff(np.floor(measured.time[own] / BLOCK))) + 1
+        told += [part for part in np.split(errors[own], edges) if len(part) >= 4]
+    return told
 
 
 def _pooled(
-    measured: Measured, told: dict[int, tuple[float, float]], source: Literal["repeats", "assumed"]
+    measured: Measured,
+    told: dict[int, tuple[float, float]],
+    source: Literal["repeats", "assumed"],
+    readings: int,
 ) -> Noise:
     """Channels that say nothing take the median of their kind; one kind shares its correlation."""
     joints = len(measured.robot.joints)
@@ -191,7 +243,7 @@ def _pooled(
             # One channel's few samples say less than all of its kind together.
             sigma[channel] = max(least, np.sqrt((own**2 + middle**2) / 2))
             rho[channel] = shared
-    return Noise(sigma, rho, source)
+    return Noise(sigma, rho, source, readings)
 
 
 def _spread(parts: Sequence[Array]) -> tuple[float, float]:

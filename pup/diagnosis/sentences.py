@@ -16,6 +16,8 @@ from pup.sysid.wording import listed
 SLOW, TARDY = 1 / 100, 1 / 5000
 """A goal that is allowed more than 100 rad/s, or 5000 rad/s2, goes as it likes."""
 QUARTER = np.pi / 2
+AWHILE = 10.0
+"""Time that a drift is told for, s."""
 MOSTLY = 0.5
 """A law that explains a smaller share of something does not describe it."""
 
@@ -205,10 +207,14 @@ def _sag(f: Facts) -> str:
 
 
 def _drift(f: Facts) -> str:
-    rate = f.size["rate"]
-    owner = "the servos" if f.finding.place.kind == "robot" else f.at
-    change = "lose" if rate > 0 else "gain"
-    return f"With run time {owner} {change} strength: {percent(abs(60 * rate))} in a minute."
+    lost = f.size["rate"] * f.size["time"] * -float(np.expm1(-AWHILE / f.size["time"]))
+    owner, s = ("the servos", "") if f.finding.place.kind == "robot" else (f.at, f.s)
+    change = f"{'lose' if lost > 0 else 'gain'}{s} strength"
+    if f.size["load"]:
+        carried = "it carries" if s else "they carry"
+        half = f"{percent(abs(lost) / 2)} in {AWHILE:g} s at half of the torque limit"
+        return f"{owner} {change} by what {carried}: {half}."
+    return f"With run time {owner} {change}: {percent(abs(lost))} in {AWHILE:g} s."
 
 
 def _cogging(f: Facts) -> str:

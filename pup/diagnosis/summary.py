@@ -191,14 +191,16 @@ def distinct(ranking: Sequence[Score], most: int) -> list[Score]:
     return list(best.values())[:most]
 
 
-def rivals(chosen: Round, final: Model | None = None) -> list[Rival]:
+def rivals(chosen: Round, diagnosis: Diagnosis, final: Model | None = None) -> list[Rival]:
     """The finalists of a round, best first, as seen from what selection ended at."""
     if not chosen.finalists:
         return []
     told = {score.trace.hypothesis: score for score in chosen.ranking}
     likely = chosen.finalists[: chosen.holding or None]
     chances = np.zeros(len(chosen.finalists))
-    chances[: len(likely)] = probabilities(likely, final or chosen.finalists[0])
+    chances[: len(likely)] = probabilities(
+        likely, final or chosen.finalists[0], diagnosis.noise, diagnosis.measured
+    )
     return [
         Rival(
             told[model.hypotheses[-1]],
@@ -226,9 +228,9 @@ def why_behind(rival: Rival, best: Rival) -> str:
     return f"explains {100 * (1 - rival.outside / best.outside):.0f} % less of motions left out"
 
 
-def why_rejected(chosen: Round) -> str:
+def why_rejected(chosen: Round, diagnosis: Diagnosis) -> str:
     """Why even the best finalist of a round was not added."""
-    told = rivals(chosen)
+    told = rivals(chosen, diagnosis)
     if not told:
         return "refitted, none of them lowers the error by more than chance does"
     if told[0].outside <= KEPT * told[0].inside:

@@ -11,7 +11,7 @@ from pup.diagnosis.evidence import overlap
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.laws import EQUATIONS
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
-from pup.diagnosis.residuals import Measured
+from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Model, Round, Selector
 from pup.physics.terms import TERMS, Place, split_column
 
@@ -26,6 +26,8 @@ BLUR = 0.5
 """Difference of worth, in what is left, at which rivals count as equals but for a factor of e."""
 DOUBT = 0.2
 """Where this share of what is to be explained is left, a name is as likely wrong as right."""
+SURE = 1.645
+"""Standard deviations of the noise floor that a model may leave beyond it."""
 WORTH_SAYING = 0.03
 """Alternatives less probable than this are not told."""
 TWIN = 0.995
@@ -89,7 +91,7 @@ class HeldOut:
     per_motion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def probabilities(models: Sequence[Model], final: Model) -> Array:
+def probabilities(models: Sequence[Model], final: Model, noise: Noise, measured: Measured) -> Array:
     """Of some rival models by their worth, if the cause is known to the library.
 
     Where the final model leaves more than noise, forms are not quite right, and rivals that leave
@@ -98,22 +100,35 @@ def probabilities(models: Sequence[Model], final: Model) -> Array:
     Args:
       models: the rivals.
       final: what selection ended at.
+      noise: that the samples are weighed by.
+      measured: the samples.
     """
     worth = np.array([m.worth for m in models])
-    weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE + BLUR * left_over(final)))
+    weights = np.exp(
+        -(worth - worth.min()) / (2 * TEMPERATURE + BLUR * left_over(final, noise, measured))
+    )
     return np.asarray(weights / weights.sum())
 
 
-def left_over(model: Model) -> float:
-    """Chi-squared that a model leaves beyond noise."""
-    return max(model.fit.chi2 - model.samples, 0.0)
+def left_over(model: Model, noise: Noise, measured: Measured) -> float:
+    """Chi-squared that a model leaves beyond noise, however large that may be at each channel."""
+    assert model.fit.residual is not None
+    usual = 1 + SURE * noise.unsure
+    beyond = np.bincount(measured.channel, model.fit.residual**2 - usual)
+    return float(np.maximum(beyond, 0.0).sum())
 
 
-def doubt(nominal: Model, final: Model) -> float:
-    """Probability that what a model explains has another cause, by what it leaves."""
-    left = left_over(final)
-    explained = max(nominal.fit.chi2 - final.fit.chi2, 1e-9)
-    share = left / (left + explained)
+def doubt(explained: float, final: Model, noise: Noise, measured: Measured) -> float:
+    """Probability that what is explained has another cause, by what the final model leaves.
+
+    Args:
+      explained: chi-squared.
+      final: what selection ended at.
+      noise: that the samples are weighed by.
+      measured: the samples.
+    """
+    left = left_over(final, noise, measured)
+    share = left / (left + max(explained, 1e-9))
     return UNKNOWN + (1 - UNKNOWN) * share / (share + DOUBT)
 
 
@@ -139,21 +154,23 @@ def findings(
         alone = len(final.hypotheses) == 1
         less = nominal.fit if alone else selector.without(final, hypothesis)
         assert less.residual is not None and final.fit.residual is not None
-        gain = less.residual**2 - final.fit.residual**2
+        squares = less.residual**2 - final.fit.residual**2
+        gain = less.chi2 - final.fit.chi2
         chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
-        probability, rivals = _rivals(hypothesis, chosen, selector, final)
+        known = 1 - doubt(gain, final, selector.noise, measured)
+        probability, rivals = _rivals(hypothesis, chosen, selector, final, known)
         told.append(
             Finding(
                 effect=hypothesis.effect,
                 place=hypothesis.place,
-                regime=strongest(found, gain),
-                when=tuple(windows(measured, gain)),
+                regime=strongest(found, squares),
+                when=tuple(windows(measured, squares)),
                 parameters=_parameters(hypothesis, final),
                 probability=probability,
                 equivalents=rivals,
                 absorbed_by=_absorbed(nominal, final),
                 law=EQUATIONS[hypothesis.effect],
-                gain=less.chi2 - final.fit.chi2,
+                gain=gain,
             )
         )
     return tuple(sorted(told, key=lambda f: -f.gain))
@@ -197,12 +214,11 @@ def held_out(measured: Measured, before: Model, after: Model, seed: int) -> Held
 
 
 def _rivals(
-    hypothesis: Hypothesis, chosen: Round, selector: Selector, final: Model
+    hypothesis: Hypothesis, chosen: Round, selector: Selector, final: Model, known: float
 ) -> tuple[float, tuple[Alternative, ...]]:
-    """The probability of a finding and of what else it might be."""
+    """The probability of a finding and of what else it might be, `known` in all."""
     models = chosen.finalists[: chosen.holding]
-    known = 1 - doubt(selector.nominal, final)
-    chances = known * probabilities(models, final)
+    chances = known * probabilities(models, final, selector.noise, selector.replays.measured)
     by_key: dict[tuple[str, Place], float] = {}
     for model, chance in zip(models, chances, strict=True):
         key = model.hypotheses[-1].key
@@ -239,19 +255,30 @@ def _twins(
 
 
 def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
+    """What was fitted of an effect, and the shapes that were chosen."""
     deviation = np.sqrt(np.diag(final.fit.covariance()))
+    units = {q.name: q.unit for q in TERMS[hypothesis.effect].quantities}
     told = {}
     for i, coordinate in enumerate(final.fit.coordinates):
-        named = split_column(coordinate.name)
-        if named is None or (named[0], named[2]) != hypothesis.key:
+        quantity = _quantity(coordinate.name, hypothesis)
+        if quantity is None:
             continue
-        quantity = next(q for q in TERMS[named[0]].quantities if q.name == named[1])
         at, reach = float(final.fit.at[i]), 1.645 * float(deviation[i])
         ends = (max(at - reach, coordinate.lower), min(at + reach, coordinate.upper))
-        told[quantity.name] = Parameter(
-            coordinate.value(at), quantity.unit, *(coordinate.value(e) for e in ends)
+        told[quantity] = Parameter(
+            coordinate.value(at), units[quantity], *(coordinate.value(e) for e in ends)
         )
+    for name, value in final.fit.fixed.items():
+        quantity = _quantity(name, hypothesis)
+        if quantity is not None:
+            told[quantity] = Parameter(value, units[quantity], value, value)
     return told
+
+
+def _quantity(name: str, hypothesis: Hypothesis) -> str | None:
+    """The quantity of a hypothesis that a parameter is; None for a parameter of something else."""
+    named = split_column(name)
+    return named[1] if named is not None and (named[0], named[2]) == hypothesis.key else None
 
 
 def _absorbed(nominal: Model, final: Model) -> dict[str, float]:

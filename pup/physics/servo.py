@@ -48,6 +48,7 @@ class Servos:
             return [term for term in outfit.terms if term.answers(hook)]
 
         self.late, self.commanding, self.sensing = of("lateness"), of("command"), of("sense")
+        self.clocks = of("pace")
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self.before: Array | None = None
@@ -95,7 +96,7 @@ class Servos:
             damping = share * damping + (1 - share) * damped
         own = self.law.unlimited(error, sensed[1])[1] if self.needs_law_damping else None
         if self.power is not None:
-            on = np.repeat(self.power[step, :running], self.candidates)[:, None]
+            on = self._on(self.power, step, running, time)
             torque *= on
             damping *= on
             own = None if own is None else own * on
@@ -145,6 +146,17 @@ class Servos:
             term.flow(flow)
         return flow.torque - flow.brake, flow.damping + flow.viscous
 
+    def _on(self, power: Array, step: int | Array, running: int, time: float | Array) -> Array:
+        """Share of a sub-step with the torque on, which is switched by the commands' clock."""
+        if not self.clocks:
+            return np.repeat(power[step, :running], self.candidates)[:, None]
+        lateness = sum(term.lateness(time, running * self.candidates) for term in self.clocks)
+        at = step - np.reshape(lateness, (running, self.candidates)) / self.scene.timestep
+        cell = np.floor(at).astype(np.int64)
+        recordings, last = np.arange(running)[:, None], len(power) - 1
+        now, after = (power[np.clip(cell + i, 0, last), recordings] for i in (0, 1))
+        return np.asarray((now + (at - cell) * (after - now)).reshape(-1, 1))
+
     def _target(self, step: int | Array, running: int, time: float | Array) -> Target:
         n = running * self.candidates
         if self.delay is None and not self.late:
@@ -192,20 +204,21 @@ class Servos:
         torque, damping = self.law.unlimited(error, velocity)
         limit = self.law.limit[: len(error)]
         upper = np.broadcast_to(limit, error.shape).copy()
-        drive = Drive(time, error, velocity, torque, upper, -upper, np.zeros_like(upper))
+        slope = np.zeros_like(upper)
+        drive = Drive(time, error, velocity, torque, damping, upper, -upper, slope)
         for term in self.driving:
             term.drive(drive)
-        ahead = self.limited.ahead(drive.torque, damping, velocity, outside)
-        _clip_between(drive, damping, ahead)
-        return error, drive.torque, damping
+        ahead = self.limited.ahead(drive.torque, drive.damping, velocity, outside)
+        _clip_between(drive, ahead)
+        return error, drive.torque, drive.damping
 
 
-def _clip_between(drive: Drive, damping: Array, ahead: Array) -> None:
+def _clip_between(drive: Drive, ahead: Array) -> None:
     """The same between two limits of their own; what falls with speed at a limit damps there."""
-    total = drive.torque - damping * ahead
+    total = drive.torque - drive.damping * ahead
     above, below = ~(total < drive.upper), ~(total > drive.lower)
     for limit, beyond in ((drive.upper, above), (drive.lower, below)):
         falls = (limit != 0) & (limit * drive.velocity >= 0)
         slope = np.where(falls, drive.slope, 0.0)
         np.copyto(drive.torque, limit + slope * drive.velocity, where=beyond)
-        np.copyto(damping, slope, where=beyond)
+        np.copyto(drive.damping, slope, where=beyond)

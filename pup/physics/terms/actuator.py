@@ -115,18 +115,41 @@ class VoltageSag(Term):
 
 
 class ThermalDrift(Term):
-    """Gains and limits drift with the time since the recording's start; positive weakens."""
+    """A servo weakens as it runs: a battery in the course of time, a motor by what it carries.
+
+    What weakens it grows with time, or with the torque's share of the limit, and is forgotten
+    again. A battery that sags takes gain and limit; a warm winding the damping too, whose
+    resistance divides all of them.
+    """
 
     effect = "thermal_drift"
-    quantities = (Quantity("rate", "1/s", 0.005, 0.05, signed=True),)
+    quantities = (
+        Quantity("rate", "1/s", 0.005, 1.0, signed=True),
+        Quantity("time", "s", 40.0, 1000.0, grid=(5.0, 40.0)),
+        Quantity("load", "1", 0.0, 1.0, grid=(0.0, 1.0)),
+    )
     source = "a 3S battery from 12.6 to 10.5 V loses 17 %, copper at +50 K 20 %"
+    state = ("_warmth",)
+
+    def prepare(self) -> None:
+        """See Term."""
+        self._warmth = np.zeros_like(self.values["rate"])
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        left = np.maximum(1 - self.values["rate"][: len(drive.torque)] * drive.time, 0.05)
+        n = len(drive.torque)
+        left = np.maximum(1 - self.values["rate"][:n] * self._warmth[:n], 0.05)
         drive.torque *= left
         drive.upper *= left
         drive.lower *= left
+        drive.damping *= 1 - self.values["load"][:n] * (1 - left)
+
+    def settle(self, error: Array, torque: Array) -> None:
+        """See Term."""
+        n, load = len(torque), self.values["load"][: len(torque)]
+        gained = 1 - load + load * np.abs(torque) / self.scene.limit[:n]
+        lost = self._warmth[:n] / self.values["time"][:n]
+        self._warmth[:n] += self.scene.timestep * (gained - lost)
 
 
 class GainAsymmetry(Term):
@@ -150,10 +173,16 @@ WEAK = 0.02
 
 
 class IntegralAction(Term):
-    """A controller's integral part, which stops growing at the servo's limit."""
+    """A controller's integral part, never more than the servo's limit.
+
+    At that limit it stops growing, or winds up as if there were none.
+    """
 
     effect = "integral_action"
-    quantities = (Quantity("gain", "N m/(rad s)", 15.0, 300.0),)
+    quantities = (
+        Quantity("gain", "N m/(rad s)", 15.0, 300.0),
+        Quantity("windup", "1", 0.0, 1.0, grid=(0.0, 1.0)),
+    )
     source = "estimate: an integral gain that takes a second to double the proportional part"
     state = ("_sum",)
 
@@ -175,6 +204,7 @@ class IntegralAction(Term):
         """See Term."""
         n, limit = len(error), self.scene.limit[: len(error)]
         wound = (np.abs(torque) >= AT_LIMIT * limit) & (torque * error > 0)
+        wound &= self.values["windup"][:n] == 0
         grown = self._sum[:n] + np.where(wound, 0.0, self.scene.timestep * error)
         most = limit / np.maximum(self.values["gain"][:n], 1e-9)
         self._sum[:n] = np.clip(grown, -most, most)

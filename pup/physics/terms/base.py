@@ -100,6 +100,7 @@ class Drive:
       error: target minus sensed position, rad.
       velocity: sensed, rad/s.
       torque: of the proportional part, N m.
+      damping: against the velocity, off the limits, N m s/rad.
       upper: largest torque of the servo, N m.
       lower: smallest one.
       slope: by how much the limit in the direction of motion falls with speed, N m s/rad; it holds
@@ -110,6 +111,7 @@ class Drive:
     error: Array
     velocity: Array
     torque: Array
+    damping: Array
     upper: Array
     lower: Array
     slope: Array
