@@ -12,7 +12,7 @@ from pup.diagnosis.evidence import Projector, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Coordinate, Fit, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.replays import Batch, Bench, Replays, threads
-from pup.diagnosis.residuals import Measured, Noise, noise_floor, steady_start
+from pup.diagnosis.residuals import Measured, Noise, noise_floor, quiet_noise, steady_start
 from pup.diagnosis.store import Store
 from pup.diagnosis.tracing import traces
 from pup.physics.parameters import robot_space
@@ -99,6 +99,19 @@ class TestNoise:
         noise = noise_floor(measured, errors)
         assert noise.source == "assumed"
         assert noise.sigma[0] == pytest.approx(0.003, rel=0.3)
+
+    def test_what_a_good_model_leaves_tells_it_but_for_its_bursts(self) -> None:
+        """Noise with a memory, and a fifth of the time something that the model lacks."""
+        measured = Measured.of(BENCH, recordings({}))
+        rng = np.random.default_rng(2)
+        own = 0.002 * rng.normal(size=len(measured.values))
+        errors = own.copy()
+        for i in range(1, len(own)):
+            errors[i] = 0.5 * errors[i - 1] + np.sqrt(0.75) * own[i]
+        errors += np.where(measured.time % 2.5 < 0.5, 0.02, 0.0)
+        noise = quiet_noise(measured, errors)
+        assert noise.sigma[0] == pytest.approx(0.002, rel=0.1)
+        assert noise.rho[0] == pytest.approx(0.5, abs=0.12)
 
     def test_whitening_undoes_correlation(self) -> None:
         measured = Measured.of(BENCH, recordings({}))

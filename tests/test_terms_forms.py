@@ -383,3 +383,15 @@ def test_a_lag_behind_a_stiff_law_at_its_limit_moves_as_its_equation_says(time: 
     before = known < 2.5  # then the joint's own end holds it
     assert np.isfinite(read).all() and before.sum() > 4
     assert np.abs(read - known)[before].max() < 0.05
+
+
+def test_torque_is_switched_by_the_clock_of_the_commands() -> None:
+    """Let go at 4 s by a clock that is a hundredth fast, the arm falls after 4 / 1.01 s."""
+    time = np.arange(0, 5.0, 0.02)
+    enabled = (time < 4.0).astype(float)
+    run = recording(BENCH, time, np.full(len(time), 0.5), 0.5, extras={"torque_enabled": enabled})
+    late, early = bench(run, {}, {"clock_skew/share@robot": 0.01})
+    falling = (time > 4.0) & (time < 4.9)
+    expected = np.interp(time[falling] + 4 - 4 / 1.01, time, late)
+    assert np.abs(early - late)[falling].max() > 0.03
+    np.testing.assert_allclose(early[falling], expected, atol=2e-3)

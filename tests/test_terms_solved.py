@@ -47,8 +47,7 @@ def viscous_square(t: float, x: Array, target: float) -> tuple[float, Sequence[f
 
 def back_emf(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     q, v = x
-    upper, lower = LIMIT - 0.3 * max(v, 0), -LIMIT - 0.3 * min(v, 0)
-    torque = np.clip(KP * (target - q) - KD * v, min(lower, 0), max(upper, 0))
+    torque = np.clip(KP * (target - q) - KD * v, -LIMIT - 0.3 * v, LIMIT - 0.3 * v)
     return torque + weight(q), ()
 
 

@@ -26,6 +26,8 @@ DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
 """Tried at once, relative to the current one: at first, and where that led nowhere."""
 ENOUGH = 0.2
 """A fit has ended when no step lowers chi-squared by as much."""
+SIGNED = 0.01
+"""A shape that may be negative, such as an angle, has this share of its limit at coordinate 1."""
 ALMOST = 1e-9
 CHEAP = 100
 """Simulations that a replay may have beside those it needs, for Jacobians of its trials."""
@@ -78,6 +80,9 @@ def term_coordinate(name: str, scale: Scale) -> Coordinate:
     assert told is not None
     quantity = next(q for q in TERMS[told[0]].quantities if q.name == told[1])
     factor = scale.factor(quantity.unit)
+    if quantity.shape and quantity.signed:
+        width = SIGNED * quantity.limit
+        return Coordinate(name, width * factor, quantity.lower / width, quantity.limit / width)
     if quantity.shape:
         lower, upper = np.log(quantity.lower * factor), np.log(quantity.limit * factor)
         return Coordinate(name, None, float(lower), float(upper))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.residuals import Measured
 from pup.physics.model import compile_model
-from pup.physics.terms import CLASS_OF, TERMS, Place, column
+from pup.physics.terms import CLASS_OF, TERMS, Place, Quantity, column
 from pup.physics.terms.scale import Scale
 
 MODERATE = 0.5
@@ -74,8 +74,13 @@ class Hypothesis:
         return tuple(
             column(self.effect, q.name, self.place)
             for q in TERMS[self.effect].quantities
-            if q.shape and not _choice(q.grid)
+            if q.shape and not _choice(q)
         )
+
+    @cached_property
+    def choices(self) -> tuple[float, ...]:
+        """Values of the other shapes, which no refit moves."""
+        return tuple(value for name, value in self.shape if name not in self.continuous)
 
     def row(self, sizes: Mapping[str, float] | None = None) -> dict[str, float]:
         """The term's columns, at given magnitudes or at moderate ones."""
@@ -179,5 +184,5 @@ def _is_below(parents: NDArray[np.int32], body: int, ancestor: int) -> bool:
     return False
 
 
-def _choice(grid: tuple[float, ...]) -> bool:
-    return len(grid) == 2
+def _choice(shape: Quantity) -> bool:
+    return shape.unit == "1" and len(shape.grid) == 2

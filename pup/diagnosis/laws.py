@@ -9,7 +9,7 @@ EQUATIONS = {
     "load_dependent_friction": "tau -= mu |tau_m - tau_e| sgn(qdot)",
     "gear_efficiency": "tau = tau_m - e |tau_m| sgn(qdot)",
     "quadratic_damping": "tau -= b qdot |qdot|",
-    "torque_speed_limit": "|tau| <= tau_max - b |qdot|",
+    "torque_speed_limit": "-tau_max <= tau_m + b qdot <= tau_max",
     "target_rate_limit": "|d goal/dt| <= 1/slowness, |d2 goal/dt2| <= 1/sluggishness",
     "command_delay": "target(t) = command(t - d)",
     "measurement_delay": "reading(t) = q(t - d)",

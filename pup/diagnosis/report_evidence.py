@@ -93,7 +93,7 @@ def _ranking(
 
 def _refits(diagnosis: Diagnosis, speech: Speech, chosen: Round) -> Iterator[Html]:
     """The finalists after their refits, and why they fell behind."""
-    finalists = summary.rivals(chosen, diagnosis, diagnosis.model)
+    finalists = summary.rivals(chosen, diagnosis)
     if not finalists:
         yield tag("p", f"{capital(summary.why_rejected(chosen, diagnosis))}.")
         return
@@ -165,9 +165,7 @@ def hiding(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
 
 def _masked(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     """How nominal parameters imitate the finalists."""
-    finalists = [
-        r for chosen in diagnosis.rounds for r in summary.rivals(chosen, diagnosis, diagnosis.model)
-    ]
+    finalists = [r for chosen in diagnosis.rounds for r in summary.rivals(chosen, diagnosis)]
     fit = diagnosis.nominal.fit
     traces = {t.hypothesis: t for t in diagnosis.found}
     told: dict[object, tuple[str, float, Array]] = {}

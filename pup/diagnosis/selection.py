@@ -24,16 +24,13 @@ from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
+from pup.diagnosis.shortlist import shortlist
 from pup.diagnosis.starts import ROUGHLY, joined, options, without_samples
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 
-FINALISTS = 8
-"""Hypotheses refitted in each round, beside those of the best one's class."""
-WORTH = 0.1
-"""A finalist promises at least this share of what the best one does."""
 FIRST, ROUGH, LAST = 2, 5, 14
 """Steps of all finalists until they are compared, of those promising then, and of the best."""
 HOPE = 0.5
@@ -222,11 +219,9 @@ class Selector:
         ranking = scores(project_again(rest, project), project(fit.residual[:, None])[:, 0])
         if not ranking or ranking[0].surprise < self.enough:
             return None
-        shortlist = _shortlist(ranking, self.enough)
-        tried = [self._started(model, score) for score in shortlist]
-        places = [
-            options(model.fit, score, f) for score, (_, f) in zip(shortlist, tried, strict=True)
-        ]
+        chosen = shortlist(ranking, self.enough)
+        tried = [self._started(model, score) for score in chosen]
+        places = [options(model.fit, score, f) for score, (_, f) in zip(chosen, tried, strict=True)]
         start_best([f for _, f in tried], places, self.replays, self.noise)
         self._refit(tried, fit.chi2)
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
@@ -259,12 +254,14 @@ class Selector:
     def _refit(self, tried: Sequence[tuple[tuple[Hypothesis, ...], Fit]], start: float) -> None:
         """Refit finalists: all for a first look, the promising roughly, the best to the end.
 
-        So are those of the best one's class: what tells them apart is small.
+        So are those of the best one's class, for what tells them apart is small, and the first,
+        which the score test has put there.
         """
         fits = [fit for _, fit in tried]
         fit_together(fits, self.replays, self.noise, iterations=FIRST)
         seen = min(fit.chi2 for fit in fits)
-        promising = [fit for fit in fits if fit.chi2 - seen < HOPE * (start - seen) + MARGIN]
+        hope = HOPE * (start - seen) + MARGIN
+        promising = [fit for fit in fits if fit is fits[0] or fit.chi2 - seen < hope]
         fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
         ranked = sorted(tried, key=lambda one: one[1].chi2)
         family, least = ranked[0][0][-1].family, ranked[0][1].chi2
@@ -272,6 +269,7 @@ class Selector:
             fit
             for rank, (hypotheses, fit) in enumerate(ranked)
             if hypotheses[-1].family == family
+            or fit is fits[0]
             or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
         ]
         for fit in close:
@@ -393,23 +391,3 @@ def _material(
     assert before.fit.residual is not None and after.fit.residual is not None
     explained = np.bincount(channel, before.fit.residual**2 - after.fit.residual**2)
     return bool((explained > MATERIAL**2 * np.bincount(channel)).any())
-
-
-def _shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
-    """The best score of each effect and place, as long as it promises enough.
-
-    Effects of the best one's class are all looked at where it acts: a nominal fit may have made
-    up for one of them to first order, as damping does for a lag, so that its slope says nothing.
-    """
-    least = max(enough, WORTH * ranking[0].surprise)
-    best: dict[object, Score] = {}
-    for score in ranking:
-        if score.surprise >= least and len(best) < FINALISTS:
-            best.setdefault(score.trace.hypothesis.key, score)
-    first = ranking[0].trace.hypothesis
-    for score in ranking:
-        other = score.trace.hypothesis
-        whole = {other.place.kind, first.place.kind} == {"robot", "bus"}
-        if other.family == first.family and (whole or other.place == first.place):
-            best.setdefault(other.key, score)
-    return list(best.values())

@@ -191,16 +191,14 @@ def distinct(ranking: Sequence[Score], most: int) -> list[Score]:
     return list(best.values())[:most]
 
 
-def rivals(chosen: Round, diagnosis: Diagnosis, final: Model | None = None) -> list[Rival]:
-    """The finalists of a round, best first, as seen from what selection ended at."""
+def rivals(chosen: Round, diagnosis: Diagnosis) -> list[Rival]:
+    """The finalists of a round, best first."""
     if not chosen.finalists:
         return []
     told = {score.trace.hypothesis: score for score in chosen.ranking}
     likely = chosen.finalists[: chosen.holding or None]
     chances = np.zeros(len(chosen.finalists))
-    chances[: len(likely)] = probabilities(
-        likely, final or chosen.finalists[0], diagnosis.noise, diagnosis.measured
-    )
+    chances[: len(likely)] = probabilities(likely, diagnosis.noise, diagnosis.measured)
     return [
         Rival(
             told[model.hypotheses[-1]],

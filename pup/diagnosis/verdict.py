@@ -91,22 +91,20 @@ class HeldOut:
     per_motion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def probabilities(models: Sequence[Model], final: Model, noise: Noise, measured: Measured) -> Array:
+def probabilities(models: Sequence[Model], noise: Noise, measured: Measured) -> Array:
     """Of some rival models by their worth, if the cause is known to the library.
 
-    Where the final model leaves more than noise, forms are not quite right, and rivals that leave
-    as much more are as good.
+    Where the best leaves more than noise, other effects are still hidden or forms are not quite
+    right, and rivals that leave as much more are as good.
 
     Args:
-      models: the rivals.
-      final: what selection ended at.
+      models: the rivals, the best first.
       noise: that the samples are weighed by.
       measured: the samples.
     """
     worth = np.array([m.worth for m in models])
-    weights = np.exp(
-        -(worth - worth.min()) / (2 * TEMPERATURE + BLUR * left_over(final, noise, measured))
-    )
+    blur = BLUR * left_over(models[0], noise, measured)
+    weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE + blur))
     return np.asarray(weights / weights.sum())
 
 
@@ -158,7 +156,7 @@ def findings(
         gain = less.chi2 - final.fit.chi2
         chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
         known = 1 - doubt(gain, final, selector.noise, measured)
-        probability, rivals = _rivals(hypothesis, chosen, selector, final, known)
+        probability, rivals = _rivals(hypothesis, chosen, selector, known)
         told.append(
             Finding(
                 effect=hypothesis.effect,
@@ -214,11 +212,11 @@ def held_out(measured: Measured, before: Model, after: Model, seed: int) -> Held
 
 
 def _rivals(
-    hypothesis: Hypothesis, chosen: Round, selector: Selector, final: Model, known: float
+    hypothesis: Hypothesis, chosen: Round, selector: Selector, known: float
 ) -> tuple[float, tuple[Alternative, ...]]:
     """The probability of a finding and of what else it might be, `known` in all."""
     models = chosen.finalists[: chosen.holding]
-    chances = known * probabilities(models, final, selector.noise, selector.replays.measured)
+    chances = known * probabilities(models, selector.noise, selector.replays.measured)
     by_key: dict[tuple[str, Place], float] = {}
     for model, chance in zip(models, chances, strict=True):
         key = model.hypotheses[-1].key

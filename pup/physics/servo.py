@@ -218,7 +218,5 @@ def _clip_between(drive: Drive, ahead: Array) -> None:
     total = drive.torque - drive.damping * ahead
     above, below = ~(total < drive.upper), ~(total > drive.lower)
     for limit, beyond in ((drive.upper, above), (drive.lower, below)):
-        falls = (limit != 0) & (limit * drive.velocity >= 0)
-        slope = np.where(falls, drive.slope, 0.0)
-        np.copyto(drive.torque, limit + slope * drive.velocity, where=beyond)
-        np.copyto(drive.damping, slope, where=beyond)
+        np.copyto(drive.torque, limit + drive.slope * drive.velocity, where=beyond)
+        np.copyto(drive.damping, drive.slope, where=beyond)

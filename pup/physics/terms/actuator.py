@@ -22,7 +22,10 @@ class QuadraticDamping(Term):
 
 
 class TorqueSpeedLimit(Term):
-    """A motor's largest torque falls with its speed: back-EMF eats the voltage."""
+    """A motor's largest torque falls with its speed: back-EMF eats the voltage.
+
+    Against the motion it adds to the voltage, and a servo brakes harder than it starts.
+    """
 
     effect = "torque_speed_limit"
     quantities = (Quantity("slope", "N m s/rad", 0.2, 1.5),)
@@ -31,11 +34,8 @@ class TorqueSpeedLimit(Term):
     def drive(self, drive: Drive) -> None:
         """See Term."""
         slope = self.values["slope"][: len(drive.torque)]
-        loss = slope * drive.velocity
-        drive.upper -= np.maximum(loss, 0.0)
-        drive.lower -= np.minimum(loss, 0.0)
-        np.maximum(drive.upper, 0.0, out=drive.upper)
-        np.minimum(drive.lower, 0.0, out=drive.lower)
+        drive.upper -= slope * drive.velocity
+        drive.lower -= slope * drive.velocity
         drive.slope += slope
 
 

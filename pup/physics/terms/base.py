@@ -103,8 +103,8 @@ class Drive:
       damping: against the velocity, off the limits, N m s/rad.
       upper: largest torque of the servo, N m.
       lower: smallest one.
-      slope: by how much the limit in the direction of motion falls with speed, N m s/rad; it holds
-        for the speed at the sub-step's end.
+      slope: by how much both limits fall with the velocity, N m s/rad; it holds for the velocity
+        at the sub-step's end.
     """
 
     time: float | Array

@@ -1,0 +1,35 @@
+"""Which hypotheses the score test sends to be refitted."""
+
+from collections.abc import Sequence
+
+from pup.diagnosis.evidence import Score
+from pup.physics.terms import Place
+
+FINALISTS = 8
+"""Hypotheses refitted in each round, beside those of the best one's class."""
+WORTH = 0.1
+"""A finalist promises at least this share of what the best one does."""
+
+
+def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
+    """The best score of each effect and place, as long as it promises enough.
+
+    Forms that no refit leads from one to the other are all looked at, and so are effects of the
+    best one's class where it acts: a nominal fit may have made up for one of them to first order,
+    as damping does for a lag, so that its slope says nothing.
+    """
+    least = max(enough, WORTH * ranking[0].surprise)
+    best: dict[tuple[tuple[str, Place], tuple[float, ...]], Score] = {}
+    for score in ranking:
+        hypothesis = score.trace.hypothesis
+        known = {key for key, _ in best}
+        room = hypothesis.key in known or len(known) < FINALISTS
+        if score.surprise >= least and room:
+            best.setdefault((hypothesis.key, hypothesis.choices), score)
+    first = ranking[0].trace.hypothesis
+    for score in ranking:
+        other = score.trace.hypothesis
+        whole = {other.place.kind, first.place.kind} == {"robot", "bus"}
+        if other.family == first.family and (whole or other.place == first.place):
+            best.setdefault((other.key, other.choices), score)
+    return list(best.values())
