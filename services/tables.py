@@ -5,6 +5,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from pup.sysid.wording import thousandths
+
 
 def bounds_table(document: dict[str, Any], unit: str) -> None:
     """Print the parameters, their bounds and the losses of a `bounds.json` document.
@@ -99,6 +101,11 @@ def walk_table(document: dict[str, Any]) -> None:
 
 def diagnosis_table(document: dict[str, Any]) -> None:
     """Print the verdict and the findings of a `diagnosis.json` document."""
+    unit = " or ".join(f"m{part}" for part in document["position_unit"].split(" or "))
+
+    def small(error: float) -> str:
+        return f"{thousandths(error)} {unit}"
+
     console = Console(highlight=False)
     console.print(f"{document['robot']}: {document['verdict']}", style="bold")
     if document["reason"]:
@@ -117,16 +124,16 @@ def diagnosis_table(document: dict[str, Any]) -> None:
         console.print(table)
     held = document["held_out"]
     if held:
-        before, after = (1e3 * held[f"rmse_{when}"] for when in ("before", "after"))
+        before, after = (small(held[f"rmse_{when}"]) for when in ("before", "after"))
         floor = document["noise_floor"]
         console.print(
-            f"on motions left out: {before:.2f} mrad before, {after:.2f} mrad after; "
-            f"noise floor {1e3 * floor['rms']:.2f} mrad ({floor['source']})",
+            f"on motions left out: {before} before, {after} after; "
+            f"noise floor {small(floor['rms'])} ({floor['source']})",
             soft_wrap=True,
         )
     if document.get("rivals"):
         models = document["rivals"]["models"].items()
-        told = ", ".join(f"{name} {1e3 * model['rmse']:.2f} mrad" for name, model in models)
+        told = ", ".join(f"{name} {small(model['rmse'])}" for name, model in models)
         console.print(f"beside rivals: {told}", soft_wrap=True)
 
 

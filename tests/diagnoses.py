@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pup.diagnosis.discover import Lack, Unexplained
+from pup.diagnosis.discover import Unexplained
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Trace, scores
 from pup.diagnosis.fitting import Fit, nominal_coordinate, term_coordinate
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.impulses import WRENCH_NAMES
+from pup.diagnosis.lacks import Lack
 from pup.diagnosis.lawfit import Law
 from pup.diagnosis.locate import MissingInput
 from pup.diagnosis.nominal import Certificate, Nominal, free_names

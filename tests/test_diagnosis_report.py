@@ -20,6 +20,7 @@ from pup.diagnosis.laws import WORDS
 from pup.diagnosis.nominal import Certificate
 from pup.diagnosis.report import write_report
 from pup.diagnosis.sentences import sentence
+from pup.diagnosis.verdict import Parameter
 from pup.diagnosis.wording import Speech, percent, shift, spoken
 from pup.physics.terms import TERMS, Place
 from pup.robot import RobotDescription, built_in_robots
@@ -102,6 +103,16 @@ def test_numbers_are_readable() -> None:
     assert shift(9.0) == "10 times what it should be"
 
 
+def test_a_delay_that_changes_is_told(op2: Maker) -> None:
+    diagnosis = op2.missing("command_delay", PLACES["bus"], time=0.012)
+    (finding,) = diagnosis.findings
+    uneven = finding.parameters | {"jitter": Parameter(0.004, "s", 0.003, 0.005)}
+    shown = sentence(diagnosis, replace(finding, parameters=uneven), speech(diagnosis))
+    assert shown == (
+        "Commands to all servos arrive 12 ms late. From tick to tick that changes by ±4 ms."
+    )
+
+
 def test_sentences_name_place_and_size(op2: Maker) -> None:
     knee, bus = PLACES["joint"], PLACES["bus"]
     assert told(op2, "backlash", knee, gap=0.008) == (
@@ -109,6 +120,10 @@ def test_sentences_name_place_and_size(op2: Maker) -> None:
     )
     assert told(op2, "command_delay", bus, time=0.012) == (
         "Commands to all servos arrive 12 ms late."
+    )
+    warm = told(op2, "thermal_drift", knee, rate=0.02, time=1000.0, load=1.0)
+    assert warm == (
+        "The left knee loses strength by what it carries: 10 % in 10 s at half of the torque limit."
     )
     assert told(op2, "torque_speed_limit", PLACES["group"]).startswith(
         "The faster the hip joints turn, the weaker the motor"

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.impulses import BUDGET, responses
+from pup.diagnosis.lacks import Lack, lack_of_fit
 from pup.diagnosis.lawfit import LAWS, Law, laws
 from pup.diagnosis.locate import BAND, MissingInput, explained_by
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import KEPT, Model, Selector
-from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter, doubt, left_over
+from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter, doubt, left_over, unexplained_errors
 from pup.physics.terms import Place
 from pup.physics.terms.learned import LearnedLaw, unit
 from pup.robot import TermSpec
@@ -33,37 +34,12 @@ MATERIAL = 0.09
 """Mean square of a channel's unexplained errors, in that of its noise, that matters."""
 FORM = 0.05
 """Share of its own trace that a wrong form of a known effect may leave."""
-BLOCK = 0.5
-"""Errors nearer than this in time are not taken for independent, s."""
-FEWEST = 40
-"""Samples of a channel below which nothing is said of it."""
 ITERATIONS = 14
 """Steps of a law's refit, at most: it may start far from where it ends."""
 TRIED = 2
 """Laws that are refitted without each fold."""
 SHARED = 0.6
 """A law that this share of all joints asks for is the robot's."""
-
-
-@dataclass(frozen=True)
-class Lack:
-    """How far a channel's errors are from noise.
-
-    Attributes:
-      channel: which.
-      excess: mean square of its whitened errors, less 1.
-      surprise: by how many standard deviations that is above 0.
-      repeated: mean product of the errors of repeats, which noise leaves at 0; None without any.
-      repeated_surprise: by how many standard deviations that is above 0.
-      explained: mean square of what missing torques would explain of it.
-    """
-
-    channel: int
-    excess: float
-    surprise: float
-    repeated: float | None
-    repeated_surprise: float
-    explained: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +79,8 @@ def unexplained(
     assert fit.residual is not None
     answers = responses(fit, replays, selector.noise, budget)
     missing = explained_by(answers, fit)
-    lacks = lack_of_fit(measured, fit.residual, missing, selector.noise.unsure)
+    errors = unexplained_errors(model, measured)
+    lacks = lack_of_fit(measured, errors, missing, selector.noise.unsure)
     flagged = [lack for lack in lacks if _matters(lack, missing)]
     left = left_over(model, selector.noise, measured)
     if not flagged or left <= selector.blur(model, FORM):
@@ -145,72 +122,6 @@ def _probability(model: Model, selector: Selector) -> float:
         return 1 - UNKNOWN
     explained = selector.nominal.fit.chi2 - model.fit.chi2
     return doubt(explained, model, selector.noise, selector.replays.measured)
-
-
-def lack_of_fit(
-    measured: Measured, residual: Array, missing: MissingInput, unsure: float
-) -> list[Lack]:
-    """How far each channel's errors are from noise.
-
-    Args:
-      measured: the samples.
-      residual: whitened, shape (n_samples,).
-      missing: the torques that would explain it.
-      unsure: share by which the noise's variance may be wrong.
-    """
-    together = _products(measured, residual)
-    told = []
-    for channel in range(measured.channels):
-        own = measured.channel == channel
-        if own.sum() < FEWEST:
-            continue
-        squares = residual[own] ** 2 - 1
-        blocks = measured.recording[own] * 10_000 + (measured.time[own] / BLOCK).astype(np.int64)
-        _, number = np.unique(blocks, return_inverse=True)
-        sums = np.bincount(number, squares - squares.mean())
-        excess = float(squares.mean())
-        spread = float(np.sqrt((sums**2).sum())) / len(squares)
-        products, known = together.get(channel, (np.empty(0), np.empty(0)))
-        repeated = float(products.mean()) if len(products) >= FEWEST else None
-        told.append(
-            Lack(
-                channel,
-                excess,
-                excess / float(np.hypot(spread, unsure)),
-                repeated,
-                0.0 if repeated is None else float(products.sum() / np.sqrt((known**2).sum())),
-                float(np.mean(missing.explained[own] ** 2)),
-            )
-        )
-    return told
-
-
-def _products(measured: Measured, residual: Array) -> dict[int, tuple[Array, Array]]:
-    """Products of the errors of repeats by channel, and the second's errors alone."""
-    pairs = repeats(measured)
-    told: dict[int, list[tuple[Array, Array]]] = {}
-    for first, second in pairs:
-        for channel in range(measured.channels):
-            one, other = (
-                (measured.recording == n) & (measured.channel == channel) for n in (first, second)
-            )
-            if min(one.sum(), other.sum()) < FEWEST:
-                continue
-            matched = np.interp(measured.time[one], measured.time[other], residual[other])
-            told.setdefault(channel, []).append((residual[one] * matched, matched))
-    return {
-        c: (np.hstack([p for p, _ in v]), np.hstack([m for _, m in v])) for c, v in told.items()
-    }
-
-
-def repeats(measured: Measured) -> list[tuple[int, int]]:
-    """Pairs of recordings of one motion, the second a repeat of the first."""
-    names = {r.id: i for i, r in enumerate(measured.recordings)}
-    return [
-        (names[r.repeat_of], i)
-        for i, r in enumerate(measured.recordings)
-        if r.repeat_of is not None and r.repeat_of in names
-    ]
 
 
 def _matters(lack: Lack, missing: MissingInput) -> bool:

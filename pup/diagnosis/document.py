@@ -30,11 +30,12 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
     robot, noise = diagnosis.robot, diagnosis.noise
     joints = len(robot.joints)
     certificate = diagnosis.nominal.certificate
-    slides = JointUnits.of(robot, diagnosis.measured.recordings).position == "m"
-    units = SLIDING if slides else {}
+    position = JointUnits.of(robot, diagnosis.measured.recordings).position
+    units = SLIDING if position == "m" else {}
     return {
         "schema": SCHEMA,
         "robot": robot.name,
+        "position_unit": position,
         "verdict": diagnosis.verdict,
         "reason": diagnosis.reason,
         "converged": certificate.holds,

@@ -109,7 +109,11 @@ def sentence(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:
     """What a finding says."""
     if finding.effect == NAMELESS:
         return _nameless(diagnosis, finding, speech)
-    return minus(capital(_TEMPLATES[finding.effect](_facts(diagnosis, finding, speech))))
+    told = capital(_TEMPLATES[finding.effect](_facts(diagnosis, finding, speech)))
+    uneven = finding.parameters.get("jitter")
+    if uneven is not None:
+        told += f" From tick to tick that changes by ±{speech.quantity(uneven.value, 's')}."
+    return minus(told)
 
 
 def _nameless(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:

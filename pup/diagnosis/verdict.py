@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import overlap
 from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.jitter import jitter
 from pup.diagnosis.laws import EQUATIONS
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
@@ -110,10 +111,16 @@ def probabilities(models: Sequence[Model], noise: Noise, measured: Measured) -> 
 
 def left_over(model: Model, noise: Noise, measured: Measured) -> float:
     """Chi-squared that a model leaves beyond noise, however large that may be at each channel."""
-    assert model.fit.residual is not None
     usual = 1 + SURE * noise.unsure
-    beyond = np.bincount(measured.channel, model.fit.residual**2 - usual)
+    beyond = np.bincount(measured.channel, unexplained_errors(model, measured) ** 2 - usual)
     return float(np.maximum(beyond, 0.0).sum())
+
+
+def unexplained_errors(model: Model, measured: Measured) -> Array:
+    """Errors of a model in units of its noise, that of a delay's jitter included, (n_samples,)."""
+    assert model.fit.residual is not None
+    uneven = jitter(model, measured)
+    return model.fit.residual if uneven is None else uneven.residual
 
 
 def doubt(explained: float, final: Model, noise: Noise, measured: Measured) -> float:
@@ -163,7 +170,7 @@ def findings(
                 place=hypothesis.place,
                 regime=strongest(found, squares),
                 when=tuple(windows(measured, squares)),
-                parameters=_parameters(hypothesis, final),
+                parameters=_parameters(hypothesis, final) | _uneven(hypothesis, final, measured),
                 probability=probability,
                 equivalents=rivals,
                 absorbed_by=_absorbed(nominal, final),
@@ -271,6 +278,12 @@ def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
         if quantity is not None:
             told[quantity] = Parameter(value, units[quantity], value, value)
     return told
+
+
+def _uneven(hypothesis: Hypothesis, final: Model, measured: Measured) -> dict[str, Parameter]:
+    """By how much a delay changes from tick to tick, where it does."""
+    told = jitter(final, measured) if hypothesis.family == "delay" else None
+    return {} if told is None else {"jitter": Parameter(told.spread, "s", told.lower, told.upper)}
 
 
 def _quantity(name: str, hypothesis: Hypothesis) -> str | None:
