@@ -229,32 +229,31 @@ def _rivals(
         key = model.hypotheses[-1].key
         by_key[key] = by_key.get(key, 0.0) + float(chance)
     own = by_key.pop(hypothesis.key)
-    twins = _twins(hypothesis, by_key, chosen, selector)
+    twins = twins_of(hypothesis, by_key, chosen)
     share = own / (1 + len(twins))
     by_key |= dict.fromkeys(twins, share)
     told = [Alternative(*key, p) for key, p in by_key.items() if p >= WORTH_SAYING]
     return share, tuple(sorted(told, key=lambda a: -a.probability))
 
 
-def _twins(
-    hypothesis: Hypothesis,
-    known: Mapping[tuple[str, Place], float],
-    chosen: Round,
-    selector: Selector,
+def twins_of(
+    hypothesis: Hypothesis, known: Mapping[tuple[str, Place], float], chosen: Round
 ) -> list[tuple[str, Place]]:
-    """Hypotheses that were not refitted but leave the same trace."""
-    traces = {s.trace.hypothesis: s.trace for s in chosen.ranking}
-    own = traces.get(hypothesis)
-    if own is None:
+    """Hypotheses that were not refitted but leave the same trace, at sizes that they can have."""
+    told = {score.trace.hypothesis: score for score in chosen.ranking}
+    if hypothesis not in told:
         return []
+    own = told[hypothesis].trace
+    change = own.left @ told[hypothesis].sizes
     refitted = {m.hypotheses[-1].key for m in chosen.finalists} | set(known) | {hypothesis.key}
     return list(
         dict.fromkeys(
             other.key
-            for other, trace in traces.items()
+            for other, trace in ((h, score.trace) for h, score in told.items())
             if other.key not in refitted
             and trace.basis.shape[1] == own.basis.shape[1] == 1
             and overlap(trace, own) > TWIN
+            and (other.signed or float(trace.left[:, 0] @ change) > 0)
         )
     )
 
