@@ -119,7 +119,7 @@ class Maker:
         folds = np.full(3, error**2 * self.samples / 3)
         known = () if hypothesis is None else (hypothesis,)
         fit = self.fit(hypothesis, error)
-        return Model(known, len(known), fit, folds, self.measured.values - off)
+        return Model(known, len(known), fit, folds, self.measured, self.measured.values - off)
 
     def trace(self, hypothesis: Hypothesis, project: Projector) -> Trace:
         """Something that a hypothesis may have left in the samples."""

@@ -26,7 +26,7 @@ def left(errors: np.ndarray, effect: str = "command_delay") -> Model:
         jacobian=(answer() * coordinate.slope(1.0))[:, None],
         chi2=float(errors @ errors),
     )
-    return Model((hypothesis,), 1, fit, np.zeros(1))
+    return Model((hypothesis,), 1, fit, np.zeros(1), MEASURED)
 
 
 def answer() -> np.ndarray:
@@ -38,16 +38,16 @@ def test_errors_that_grow_with_what_a_delay_does_are_its_jitter() -> None:
     rng = np.random.default_rng(0)
     noise, uneven = rng.normal(size=(2, len(MEASURED.values)))
     model = left(noise + SPREAD * answer() * uneven)
-    found = jitter(model, MEASURED)
+    found = jitter(model)
     assert found is not None
     assert found.spread == pytest.approx(SPREAD, rel=0.1)
     assert found.lower < SPREAD < found.upper
-    assert np.mean(unexplained_errors(model, MEASURED) ** 2) == pytest.approx(1, abs=0.1)
+    assert np.mean(unexplained_errors(model) ** 2) == pytest.approx(1, abs=0.1)
 
 
 def test_noise_is_no_jitter() -> None:
     noise = np.random.default_rng(1).normal(size=len(MEASURED.values))
-    assert jitter(left(noise), MEASURED) is None
+    assert jitter(left(noise)) is None
 
 
 def test_what_repeats_is_no_jitter() -> None:
@@ -55,12 +55,12 @@ def test_what_repeats_is_no_jitter() -> None:
     noise = np.random.default_rng(2).normal(size=len(MEASURED.values))
     missing = 3 * np.sign(np.sin(20 * MEASURED.time)) * (answer() > 200)
     model = left(noise + missing)
-    assert jitter(model, MEASURED) is None
-    assert np.array_equal(unexplained_errors(model, MEASURED), noise + missing)
+    assert jitter(model) is None
+    assert np.array_equal(unexplained_errors(model), noise + missing)
 
 
 def test_without_a_delay_there_is_nothing_to_jitter() -> None:
     rng = np.random.default_rng(3)
     noise, uneven = rng.normal(size=(2, len(MEASURED.values)))
     model = left(noise + SPREAD * answer() * uneven, "coulomb_friction")
-    assert jitter(model, MEASURED) is None
+    assert jitter(model) is None

@@ -79,10 +79,10 @@ def unexplained(
     assert fit.residual is not None
     answers = responses(fit, replays, selector.noise, budget)
     missing = explained_by(answers, fit)
-    errors = unexplained_errors(model, measured)
+    errors = unexplained_errors(model)
     lacks = lack_of_fit(measured, errors, missing, selector.noise.unsure)
     flagged = [lack for lack in lacks if _matters(lack, missing)]
-    left = left_over(model, selector.noise, measured)
+    left = left_over(model, selector.noise)
     if not flagged or left <= selector.blur(model, FORM):
         return None
     place, joints = _place(measured, missing, flagged)
@@ -121,7 +121,7 @@ def _probability(model: Model, selector: Selector) -> float:
     if not model.hypotheses:
         return 1 - UNKNOWN
     explained = selector.nominal.fit.chi2 - model.fit.chi2
-    return doubt(explained, model, selector.noise, selector.replays.measured)
+    return doubt(explained, model, selector.noise)
 
 
 def _matters(lack: Lack, missing: MissingInput) -> bool:

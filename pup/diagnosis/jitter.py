@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pup.diagnosis.lacks import repeated
-from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import Model
 from pup.physics.terms import CLASS_OF, split_column
 
@@ -43,17 +42,16 @@ class Jitter:
     residual: Array
 
 
-def jitter(model: Model, measured: Measured) -> Jitter | None:
+def jitter(model: Model) -> Jitter | None:
     """The jitter of a model's delay; None without one, or where its errors repeat.
 
     Args:
       model: fitted, with its Jacobian and residual.
-      measured: the samples.
     """
     fit = model.fit
     assert fit.jacobian is not None and fit.residual is not None
     late = [i for i, name in enumerate(fit.names) if _is_delay(name)]
-    shared = repeated(measured, fit.residual)
+    shared = repeated(model.measured, fit.residual)
     if not late or not shared or max(one.surprise for one in shared.values()) > REPEATED:
         return None
     slopes = np.array([fit.coordinates[i].slope(float(fit.at[i])) for i in late])

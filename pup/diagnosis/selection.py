@@ -23,7 +23,7 @@ from pup.diagnosis.fitting import (
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
-from pup.diagnosis.residuals import LOST, Noise
+from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.shortlist import shortlist
 from pup.diagnosis.starts import ROUGHLY, joined, options, without_samples
 from pup.physics.terms import Place
@@ -69,6 +69,7 @@ class Model:
       freedom: of their magnitudes and shapes, how many the data see.
       fit: of nominal parameters and effects together.
       held_out: what each fold costs by a fit without it, shape (n_folds,); see `folds.left_out`.
+      measured: the samples that it was fitted to.
       predicted: what those fits predict, shape (n_samples,), rad; empty where nobody has asked.
     """
 
@@ -76,6 +77,7 @@ class Model:
     freedom: int
     fit: Fit
     held_out: Array
+    measured: Measured
     predicted: Array = field(default_factory=lambda: np.empty(0))
 
     @property
@@ -343,6 +345,7 @@ class Selector:
                 self._freedom(hypotheses),
                 fit,
                 np.array([left_out(fit, inside) for inside in insides]),
+                self.replays.measured,
             )
             for hypotheses, fit in fitted
         ]

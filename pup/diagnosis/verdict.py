@@ -92,7 +92,7 @@ class HeldOut:
     per_motion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def probabilities(models: Sequence[Model], noise: Noise, measured: Measured) -> Array:
+def probabilities(models: Sequence[Model], noise: Noise) -> Array:
     """Of some rival models by their worth, if the cause is known to the library.
 
     Where the best leaves more than noise, other effects are still hidden or forms are not quite
@@ -101,38 +101,36 @@ def probabilities(models: Sequence[Model], noise: Noise, measured: Measured) -> 
     Args:
       models: the rivals, the best first.
       noise: that the samples are weighed by.
-      measured: the samples.
     """
     worth = np.array([m.worth for m in models])
-    blur = BLUR * left_over(models[0], noise, measured)
+    blur = BLUR * left_over(models[0], noise)
     weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE + blur))
     return np.asarray(weights / weights.sum())
 
 
-def left_over(model: Model, noise: Noise, measured: Measured) -> float:
+def left_over(model: Model, noise: Noise) -> float:
     """Chi-squared that a model leaves beyond noise, however large that may be at each channel."""
     usual = 1 + SURE * noise.unsure
-    beyond = np.bincount(measured.channel, unexplained_errors(model, measured) ** 2 - usual)
+    beyond = np.bincount(model.measured.channel, unexplained_errors(model) ** 2 - usual)
     return float(np.maximum(beyond, 0.0).sum())
 
 
-def unexplained_errors(model: Model, measured: Measured) -> Array:
+def unexplained_errors(model: Model) -> Array:
     """Errors of a model in units of its noise, that of a delay's jitter included, (n_samples,)."""
     assert model.fit.residual is not None
-    uneven = jitter(model, measured)
+    uneven = jitter(model)
     return model.fit.residual if uneven is None else uneven.residual
 
 
-def doubt(explained: float, final: Model, noise: Noise, measured: Measured) -> float:
+def doubt(explained: float, final: Model, noise: Noise) -> float:
     """Probability that what is explained has another cause, by what the final model leaves.
 
     Args:
       explained: chi-squared.
       final: what selection ended at.
       noise: that the samples are weighed by.
-      measured: the samples.
     """
-    left = left_over(final, noise, measured)
+    left = left_over(final, noise)
     share = left / (left + max(explained, 1e-9))
     return UNKNOWN + (1 - UNKNOWN) * share / (share + DOUBT)
 
@@ -162,7 +160,7 @@ def findings(
         squares = less.residual**2 - final.fit.residual**2
         gain = less.chi2 - final.fit.chi2
         chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
-        known = 1 - doubt(gain, final, selector.noise, measured)
+        known = 1 - doubt(gain, final, selector.noise)
         probability, rivals = _rivals(hypothesis, chosen, selector, known)
         told.append(
             Finding(
@@ -170,7 +168,7 @@ def findings(
                 place=hypothesis.place,
                 regime=strongest(found, squares),
                 when=tuple(windows(measured, squares)),
-                parameters=_parameters(hypothesis, final) | _uneven(hypothesis, final, measured),
+                parameters=_parameters(hypothesis, final) | _uneven(hypothesis, final),
                 probability=probability,
                 equivalents=rivals,
                 absorbed_by=_absorbed(nominal, final),
@@ -223,7 +221,7 @@ def _rivals(
 ) -> tuple[float, tuple[Alternative, ...]]:
     """The probability of a finding and of what else it might be, `known` in all."""
     models = chosen.finalists[: chosen.holding]
-    chances = known * probabilities(models, selector.noise, selector.replays.measured)
+    chances = known * probabilities(models, selector.noise)
     by_key: dict[tuple[str, Place], float] = {}
     for model, chance in zip(models, chances, strict=True):
         key = model.hypotheses[-1].key
@@ -279,9 +277,9 @@ def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
     return told
 
 
-def _uneven(hypothesis: Hypothesis, final: Model, measured: Measured) -> dict[str, Parameter]:
+def _uneven(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
     """By how much a delay changes from tick to tick, where it does."""
-    told = jitter(final, measured) if hypothesis.family == "delay" else None
+    told = jitter(final) if hypothesis.family == "delay" else None
     return {} if told is None else {"jitter": Parameter(told.spread, "s", told.lower, told.upper)}
 
 

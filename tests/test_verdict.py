@@ -1,0 +1,66 @@
+"""What fitted models amount to: twins of a finding, and what a model leaves."""
+
+import numpy as np
+import pytest
+
+from pup.diagnosis.evidence import Score, Trace
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.residuals import Measured, Noise
+from pup.diagnosis.selection import Model, Round
+from pup.diagnosis.verdict import doubt, left_over, probabilities, twins_of
+from tests.diagnosis_cases import BENCH, recordings
+
+MEASURED = Measured.of(BENCH, recordings({}))
+CHANGE = np.linspace(-1, 1, 50)[:, None] / 4
+
+
+def score(effect: str, sign: float, size: float) -> Score:
+    hypothesis = next(h for h in hypotheses(MEASURED) if h.effect == effect)
+    trace = Trace(hypothesis, sign * CHANGE, sign * CHANGE, CHANGE / np.linalg.norm(CHANGE))
+    return Score(trace, 9.0, 1, np.array([size]))
+
+
+@pytest.mark.parametrize(
+    ("effect", "sign", "told"),
+    [
+        ("measurement_delay", 1.0, True),
+        ("derivative_kick", -1.0, False),  # it would have to be negative
+        ("clock_skew", -1.0, True),  # which may be
+    ],
+)
+def test_twins_have_sizes_that_they_can_have(effect: str, sign: float, told: bool) -> None:
+    own, other = score("command_delay", 1.0, 2.0), score(effect, sign, 2.0 * sign)
+    chosen = Round(None, (own, other), (), 1)  # type: ignore[arg-type]
+    found = twins_of(own.trace.hypothesis, {}, chosen)
+    assert [name for name, _ in found] == ([effect] if told else [])
+
+
+def left(measured: Measured, error: float, worth: float = 0.0) -> Model:
+    """A model that leaves errors of some size, in units of the noise."""
+    residual = error * np.random.default_rng(0).normal(size=len(measured.values))
+    fit = Fit((), np.empty(0), residual=residual, jacobian=np.empty((len(residual), 0)))
+    fit.chi2 = float(residual @ residual)
+    return Model((), 0, fit, np.array([worth]), measured)
+
+
+def test_a_model_of_some_recordings_leaves_what_it_leaves_of_those() -> None:
+    """Rounds of a first look, at what the nominal model can follow, are judged by their samples."""
+    some = Measured.of(BENCH, MEASURED.recordings[:2])
+    noise = Noise(np.full(3, 0.002), np.zeros(3), "repeats")
+    assert left_over(left(some, 1.0), noise) == 0
+    beyond = left_over(left(some, 2.0), noise)
+    assert beyond == pytest.approx(2.9 * len(some.values), rel=0.1)
+    assert probabilities([left(some, 2.0), left(some, 2.0, 1.0)], noise).sum() == pytest.approx(1)
+
+
+def test_noise_that_is_not_well_known_is_no_reason_to_doubt() -> None:
+    """A tenth more than the floor is doubtful by a floor of many readings, not by one of few."""
+    model = left(MEASURED, np.sqrt(1.25))
+    sure, unsure = (
+        Noise(np.full(3, 0.002), np.zeros(3), "repeats", readings) for readings in (100_000, 60)
+    )
+    gained = 2000.0
+    assert doubt(gained, model, sure) > 0.15
+    assert doubt(gained, model, unsure) == pytest.approx(0.03)
+    assert doubt(gained / 100, model, sure) > doubt(gained, model, sure)
