@@ -115,7 +115,8 @@ class Maker:
 
     def model(self, hypothesis: Hypothesis | None, error: float) -> Model:
         """A fitted model whose predictions are off by as much."""
-        off = error * SIGMA * self.rng.normal(size=self.samples)
+        off = self.rng.normal(size=self.samples)
+        off *= error * SIGMA / np.sqrt(np.mean(off**2))
         folds = np.full(3, error**2 * self.samples / 3)
         known = () if hypothesis is None else (hypothesis,)
         fit = self.fit(hypothesis, error)

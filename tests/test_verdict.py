@@ -31,7 +31,7 @@ def score(effect: str, sign: float, size: float) -> Score:
 )
 def test_twins_have_sizes_that_they_can_have(effect: str, sign: float, told: bool) -> None:
     own, other = score("command_delay", 1.0, 2.0), score(effect, sign, 2.0 * sign)
-    chosen = Round(None, (own, other), (), 1)  # type: ignore[arg-type]
+    chosen = Round(left(MEASURED, 1.0), (own, other), (), 1)
     found = twins_of(own.trace.hypothesis, {}, chosen)
     assert [name for name, _ in found] == ([effect] if told else [])
 

@@ -51,8 +51,10 @@ def jitter(model: Model) -> Jitter | None:
     fit = model.fit
     assert fit.jacobian is not None and fit.residual is not None
     late = [i for i, name in enumerate(fit.names) if _is_delay(name)]
+    if not late:
+        return None
     shared = repeated(model.measured, fit.residual)
-    if not late or not shared or max(one.surprise for one in shared.values()) > REPEATED:
+    if not shared or max(one.surprise for one in shared.values()) > REPEATED:
         return None
     slopes = np.array([fit.coordinates[i].slope(float(fit.at[i])) for i in late])
     answer = np.sum((fit.jacobian[:, late] / slopes) ** 2, axis=1)

@@ -87,10 +87,10 @@ class Servos:
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
         outside = None if still else self.limited.outside(sensed[1])
-        error, torque, damping = self._answer(target.now, sensed, outside, time)
+        error, torque, damping = self._answer(target.now, sensed, outside)
         if target.before is not None:
             share = self._spread(target.share, running)
-            old, was, damped = self._answer(target.before, sensed, outside, time)
+            old, was, damped = self._answer(target.before, sensed, outside)
             error = share * error + (1 - share) * old
             torque = share * torque + (1 - share) * was
             damping = share * damping + (1 - share) * damped
@@ -188,7 +188,6 @@ class Servos:
         target: Array,
         sensed: tuple[Array, Array],
         outside: Array | None,
-        time: float | Array,
     ) -> tuple[Array, Array, Array]:
         """The law's error, torque and viscous coefficient for one target."""
         position, velocity = sensed
@@ -205,7 +204,7 @@ class Servos:
         limit = self.law.limit[: len(error)]
         upper = np.broadcast_to(limit, error.shape).copy()
         slope = np.zeros_like(upper)
-        drive = Drive(time, error, velocity, torque, damping, upper, -upper, slope)
+        drive = Drive(error, velocity, torque, damping, upper, -upper, slope)
         for term in self.driving:
             term.drive(drive)
         ahead = self.limited.ahead(drive.torque, drive.damping, velocity, outside)

@@ -96,7 +96,6 @@ class Drive:
     """A servo's static law in the making; arrays of shape (n_active, n_joints).
 
     Attributes:
-      time: since the recording's start, s; or since each simulation's own, shape (n_active, 1).
       error: target minus sensed position, rad.
       velocity: sensed, rad/s.
       torque: of the proportional part, N m.
@@ -107,7 +106,6 @@ class Drive:
         at the sub-step's end.
     """
 
-    time: float | Array
     error: Array
     velocity: Array
     torque: Array
