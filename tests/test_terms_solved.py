@@ -62,19 +62,17 @@ def lopsided(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]
     return servo(error * (1.2 if error > 0 else 0.8), x[1]) + weight(x[0]), ()
 
 
-def integrating(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
-    q, v, total = x
-    asked = KP * (target - q) + 15 * total - KD * v
-    wound = abs(asked) >= LIMIT and asked * (target - q) > 0
-    return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if wound else target - q]
+def integrating(share: float) -> Law:
+    """An integral that winds up as far as a share of the limit."""
 
+    def law(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+        q, v, total = x
+        most = share * LIMIT / 15
+        asked = KP * (target - q) + 15 * np.clip(total, -most, most) - KD * v
+        full = abs(total) >= most and total * (target - q) > 0
+        return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if full else target - q]
 
-def wound_up(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
-    q, v, total = x
-    most = LIMIT / 15
-    asked = KP * (target - q) + 15 * np.clip(total, -most, most) - KD * v
-    full = abs(total) >= most and total * (target - q) > 0
-    return np.clip(asked, -LIMIT, LIMIT) + weight(q), [0.0 if full else target - q]
+    return law
 
 
 def warming(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
@@ -198,10 +196,10 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "torque_speed_limit": ({"slope": 0.3}, back_emf, (), INERTIA, 1e-4),
     "thermal_drift": ({"rate": 0.05}, drifting, (), INERTIA, 1e-4),
     "gain_asymmetry": ({"share": 0.2}, lopsided, (), INERTIA, 1e-4),
-    "integral_action": ({"gain": 15.0}, integrating, (0.0,), INERTIA, 5e-4),
-    "integral_action, winding up": (
-        {"gain": 15.0, "windup": 1.0},
-        wound_up,
+    "integral_action": ({"gain": 15.0}, integrating(0.3), (0.0,), INERTIA, 5e-4),
+    "integral_action, all of the limit": (
+        {"gain": 15.0, "share": 1.0},
+        integrating(1.0),
         (0.0,),
         INERTIA,
         5e-4,

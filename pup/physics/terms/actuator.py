@@ -166,22 +166,20 @@ class GainAsymmetry(Term):
         drive.torque *= np.where(drive.error > 0, 1 + share, 1 - share)
 
 
-AT_LIMIT = 0.999
-"""Share of its torque limit from which a servo integrates its error no further."""
 WEAK = 0.02
 """An integral gain far below takes longer than anyone waits to take up a load, N m/(rad s)."""
 
 
 class IntegralAction(Term):
-    """A controller's integral part, never more than the servo's limit.
+    """A controller's integral part, kept within a share of the servo's limit.
 
-    At that limit it stops growing, or winds up as if there were none.
+    Within it the integral grows also while the servo is at its limit (it winds up).
     """
 
     effect = "integral_action"
     quantities = (
         Quantity("gain", "N m/(rad s)", 15.0, 300.0),
-        Quantity("windup", "1", 0.0, 1.0, grid=(0.0, 1.0)),
+        Quantity("share", "1", 0.3, 1.0, grid=(0.1, 0.3, 1.0)),
     )
     source = "estimate: an integral gain that takes a second to double the proportional part"
     state = ("_sum",)
@@ -203,10 +201,8 @@ class IntegralAction(Term):
     def settle(self, error: Array, torque: Array) -> None:
         """See Term."""
         n, limit = len(error), self.scene.limit[: len(error)]
-        wound = (np.abs(torque) >= AT_LIMIT * limit) & (torque * error > 0)
-        wound &= self.values["windup"][:n] == 0
-        grown = self._sum[:n] + np.where(wound, 0.0, self.scene.timestep * error)
-        most = limit / np.maximum(self.values["gain"][:n], 1e-9)
+        most = self.values["share"][:n] * limit / np.maximum(self.values["gain"][:n], 1e-9)
+        grown = self._sum[:n] + self.scene.timestep * error
         self._sum[:n] = np.clip(grown, -most, most)
 
 
