@@ -61,6 +61,6 @@ def test_noise_that_is_not_well_known_is_no_reason_to_doubt() -> None:
         Noise(np.full(3, 0.002), np.zeros(3), "repeats", readings) for readings in (100_000, 60)
     )
     gained = 2000.0
-    assert doubt(gained, model, sure) > 0.15
-    assert doubt(gained, model, unsure) == pytest.approx(0.03)
-    assert doubt(gained / 100, model, sure) > doubt(gained, model, sure)
+    assert doubt(gained, left_over(model, sure)) > 0.15
+    assert doubt(gained, left_over(model, unsure)) == pytest.approx(0.03)
+    assert doubt(gained / 100, left_over(model, sure)) > doubt(gained, left_over(model, sure))

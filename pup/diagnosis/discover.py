@@ -121,7 +121,7 @@ def _probability(model: Model, selector: Selector) -> float:
     if not model.hypotheses:
         return 1 - UNKNOWN
     explained = selector.nominal.fit.chi2 - model.fit.chi2
-    return doubt(explained, model, selector.noise)
+    return doubt(explained, left_over(model, selector.noise))
 
 
 def _matters(lack: Lack, missing: MissingInput) -> bool:

@@ -20,7 +20,7 @@ from pup.physics.terms.scale import Scale
 
 Array = NDArray[np.float64]
 
-STEP = 0.004
+STEP = 0.0004
 """Finite-difference step, of a coordinate."""
 DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
 """Tried at once, relative to the current one: at first, and where that led nowhere."""

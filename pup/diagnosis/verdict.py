@@ -122,15 +122,13 @@ def unexplained_errors(model: Model) -> Array:
     return model.fit.residual if uneven is None else uneven.residual
 
 
-def doubt(explained: float, final: Model, noise: Noise) -> float:
-    """Probability that what is explained has another cause, by what the final model leaves.
+def doubt(explained: float, left: float) -> float:
+    """Probability that what is explained has another cause, by what is left.
 
     Args:
       explained: chi-squared.
-      final: what selection ended at.
-      noise: that the samples are weighed by.
+      left: chi-squared beyond noise.
     """
-    left = left_over(final, noise)
     share = left / (left + max(explained, 1e-9))
     return UNKNOWN + (1 - UNKNOWN) * share / (share + DOUBT)
 
@@ -152,6 +150,7 @@ def findings(
       found: the regimes of motion.
     """
     nominal = selector.nominal
+    left = left_over(final, selector.noise)
     told = []
     for hypothesis in final.hypotheses:
         alone = len(final.hypotheses) == 1
@@ -160,7 +159,8 @@ def findings(
         squares = less.residual**2 - final.fit.residual**2
         gain = less.chi2 - final.fit.chi2
         chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
-        known = 1 - doubt(gain, final, selector.noise)
+        # What is hardly more than chance counts little, and so comes after what explains much.
+        known = 1 - doubt(gain, left + selector.enough)
         probability, rivals = _rivals(hypothesis, chosen, selector, known)
         told.append(
             Finding(

@@ -8,8 +8,8 @@ from pup.physics.terms.base import Flow, Quantity, Term
 
 Array = NDArray[np.float64]
 
-GRIP = 3e-4
-"""How far a joint gives before dry friction slips, rad: a fifth of an MX-28's encoder step."""
+GRIP = 5e-5
+"""How far a joint gives before dry friction slips, rad: what no encoder of a servo would see."""
 
 
 class Friction(Term):
