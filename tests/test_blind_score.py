@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from commandline import pup
 
+from pup.blind.judge import ranking
 from pup.blind.score import Replayed, score_set
 from pup.blind.seal import commit, write_key
 from pup.blind.statistics import calibration, rate
@@ -169,6 +170,23 @@ def test_every_failure_is_listed(revealed: Path) -> None:
         "u": ["sharp name where the data cannot tell"],
         "n2": ["false positive"],
     }
+
+
+def test_among_equals_the_order_of_the_document_counts() -> None:
+    """A finding, then its equivalents, then the next one; names have no say."""
+    told = verdict(
+        "mismatch",
+        finding(
+            *("quadratic_damping", KNEE, 0.5),
+            equivalents=[named("torque_speed_limit", KNEE, 0.5), named("backlash", HIP, 0.5)],
+        ),
+        finding("payload", KNEE, 0.9),
+        finding("clock_skew", BUS, 0.5, equivalents=[named("armature", KNEE, 0.2)]),
+    )
+    assert [n.effect for n in ranking(told)] == [
+        *("payload", "quadratic_damping", "torque_speed_limit", "backlash"),
+        *("clock_skew", "armature"),
+    ]
 
 
 def test_calibration_over_the_cases_that_name_something(revealed: Path) -> None:

@@ -83,12 +83,14 @@ class Judged:
 
 
 def ranking(diagnosis: Mapping[str, Any]) -> list[Named]:
-    """Findings and their equivalents by probability; among equals, findings first."""
-    findings = diagnosis.get("findings", [])
+    """Findings and their equivalents by probability; among equals, as they stand in the document.
+
+    There the more important finding stands first, and each before its equivalents.
+    """
     named = [
         Named(str(e["effect"]), e["place"], float(e["probability"]))
-        for group in (findings, [e for f in findings for e in f.get("equivalents", [])])
-        for e in group
+        for finding in diagnosis.get("findings", [])
+        for e in (finding, *finding.get("equivalents", []))
     ]
     return sorted(named, key=lambda n: -n.probability)
 

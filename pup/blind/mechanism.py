@@ -256,6 +256,8 @@ def _adjust(
             masses[:, bodies] += effect.size
         elif effect.name == "com_offset":
             centres[:, bodies] += effect.size * np.array([effect.shape[a] for a in "xyz"])
+        elif effect.name == "structural_flex":
+            _root(batch, model, bodies)
         elif effect.name == "armature":
             rotors[:, mechanism.dofs[world.joints_at(effect.place)]] += effect.size
         elif effect.name in ("ground_friction", "ground_compliance", "contact_restitution"):
@@ -272,3 +274,18 @@ def _adjust(
     batch.expand("dof_solref")[:] = FIRM
     batch.expand("dof_solimp")[:] = STICKY
     batch.set_const()
+
+
+def _root(batch: Batch, model: mujoco.MjModel, bodies: Sequence[int]) -> None:
+    """Leave the roots of bending bodies where their parents carry them.
+
+    A knob that moves a body's frame would take the root along, which is told in that frame. A body
+    with a driven joint bends there, and the knob moves both.
+    """
+    places, roots = batch.expand("body_pos"), batch.expand("jnt_pos")
+    turn = np.empty(9)
+    for body in bodies:
+        if model.body_jntnum[body] == 1:  # nothing but what bends
+            mujoco.mju_quat2Mat(turn, model.body_quat[body])
+            moved = places[:, body] - model.body_pos[body]
+            roots[:, model.body_jntadr[body]] -= moved @ turn.reshape(3, 3)
