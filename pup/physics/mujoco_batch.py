@@ -32,9 +32,6 @@ Array = NDArray[np.float64]
 SIMULATIONS = 512
 """Simulations in a batch: enough to hide NumPy's overhead, few enough to stay in cache."""
 
-SAG = 1.5
-"""Of the load that gravity is, at the start: what more a joint needs is no sag but a command."""
-
 _BROKEN = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
@@ -266,19 +263,11 @@ class Run:
             term.prepare()
         holding = [term for term in self.terms if term.answers("held")]
         if holding and not model.floating:  # on the floor, contacts hold too
-            load = self._load(bias)
+            gravity = bias[:, model.dofs]
+            load = gravity - self.force[:, model.dofs]
+            on = np.repeat(self.group.power[0], self.candidates)[:, None]
             for term in holding:
-                term.held(load)
-
-    def _load(self, bias: Array) -> Array:
-        """What a joint at rest would need beside the torques at the start, if it is at rest.
-
-        A command that jumps at the start asks for more than any load: then nothing is told.
-        """
-        bias = bias[:, self.group.model.dofs]
-        needed = bias - self.force[:, self.group.model.dofs]
-        on = np.repeat(self.group.power[0], self.candidates)[:, None]
-        return np.asarray(on * np.where(np.abs(needed) < SAG * np.abs(bias), needed, 0.0))
+                load = term.held(load, on * gravity)
 
     def _tried(self, train: Drivetrain, sensed: tuple[Array, Array]) -> Array:
         """Half of the velocity that links gain in a first sub-step, which is then undone.

@@ -166,6 +166,8 @@ class GainAsymmetry(Term):
         drive.torque *= np.where(drive.error > 0, 1 + share, 1 - share)
 
 
+SAG = 1.5
+"""Of the load that gravity is, at the start: what more a joint needs is no sag but a command."""
 WEAK = 0.02
 """An integral gain far below takes longer than anyone waits to take up a load, N m/(rad s)."""
 
@@ -188,22 +190,30 @@ class IntegralAction(Term):
         """See Term."""
         self._sum = np.zeros_like(self.values["gain"])
 
-    def held(self, load: Array) -> None:
-        """See Term: a controller that has held a load for long starts with it in its integral."""
-        self._sum += load / (self.values["gain"] + WEAK)
+    def held(self, load: Array, gravity: Array) -> Array:
+        """See Term: a controller that has held a load for long starts with it in its integral.
+
+        A command that jumps at the start asks for more than any load: of that it knows nothing.
+        """
+        own = np.where(np.abs(load) < SAG * np.abs(gravity), load, 0.0)
+        self._sum += own / (self.values["gain"] + WEAK)
+        return load - own
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
         n = len(drive.torque)
-        now = self._sum[:n] + self.scene.timestep / 2 * drive.error
-        drive.torque += self.values["gain"][:n] * now
+        drive.torque += self.values["gain"][:n] * self._after(self.scene.timestep / 2, drive.error)
 
     def settle(self, error: Array, torque: Array) -> None:
         """See Term."""
-        n, limit = len(error), self.scene.limit[: len(error)]
-        most = self.values["share"][:n] * limit / np.maximum(self.values["gain"][:n], 1e-9)
-        grown = self._sum[:n] + self.scene.timestep * error
-        self._sum[:n] = np.clip(grown, -most, most)
+        self._sum[: len(error)] = self._after(self.scene.timestep, error)
+
+    def _after(self, time: float | Array, error: Array) -> Array:
+        """What an error makes of the integral in some time, rad s."""
+        n = len(error)
+        most = self.scene.limit[:n] / np.maximum(self.values["gain"][:n], 1e-9)
+        most *= self.values["share"][:n]
+        return np.clip(self._sum[:n] + time * error, -most, most)
 
 
 class DerivativeKick(Term):

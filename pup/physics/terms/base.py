@@ -208,11 +208,15 @@ class Term:
 
     # The hooks below raise: a term overrides those it has, and `answers` keeps the others uncalled.
 
-    def held(self, load: Array) -> None:
+    def held(self, load: Array, gravity: Array) -> Array:
         """Take note, at the start, of what joints at rest need beside all torques told.
 
         Args:
-          load: shape (n_simulations, n_joints), N m.
+          load: what they need, shape (n_simulations, n_joints), N m.
+          gravity: what they need with no torque told, 0 where the torque is off, same shape.
+
+        Returns:
+          What this term does not hold of the load.
         """
         raise NotImplementedError
 

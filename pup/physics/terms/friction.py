@@ -3,42 +3,56 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.implicit import implicit_share
 from pup.physics.terms.base import Flow, Quantity, Term
 
 Array = NDArray[np.float64]
 
 GRIP = 5e-5
 """How far a joint gives before dry friction slips, rad: what no encoder of a servo would see."""
+FIRMEST = 2.0
+"""Squared phase of a joint that swings on its bristle, in a sub-step, from which it is softened."""
+HARDLY = 1e-4
+"""Slip, as a share of a bristle's length, that bends it in proportion."""
 
 
 class Friction(Term):
     """Friction of some level on a joint, as the deflection of a bristle (Dahl 1968).
 
-    The bristle follows the joint and slips at `level`. Its torque is taken from between the
-    sub-step's middle, where the bristle is soft, and its end, where it is stiff: however stiff it
-    is, the joint rests where friction holds it.
+    The bristle follows the joint and slips at `level`. Its torque is the mean from half a sub-step
+    before the position to half a one after it, the first half by the velocity that was, the second
+    by the one to come: so a reversal costs what it should wherever in a sub-step it falls.
     """
 
     state = ("_bend",)
 
     def prepare(self) -> None:
         """See Term."""
-        self._bend = np.zeros_like(self.scene.inertia)
+        self._bend = np.zeros_like(self.scene.inertia)  # as a share of where it slips
+        self._load: Array | None = None
+
+    def held(self, load: Array, gravity: Array) -> Array:
+        """See Term: a joint that is found at rest has its bristle bent by what it holds."""
+        self._load = load
+        return np.zeros_like(load)
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n, step, velocity = len(flow.torque), self.scene.timestep, flow.velocity
-        length, bend = self.length(n), self._bend[:n]
-        kept = np.exp(-np.abs(velocity) * (step / length))
-        bend *= kept
-        bend += np.sign(velocity) * (length * (1 - kept))
-        stiffness = self.level(flow) / length
-        share = implicit_share(stiffness * step, self.scene.inertia[:n], step)
-        slip = np.maximum(np.abs(flow.coming) * (share * step / length), 1e-9)
-        kept = np.exp(-slip)
-        flow.torque -= stiffness * kept * bend
-        flow.damping += stiffness * step * share * (1 - kept) / slip
+        n, step = len(flow.torque), self.scene.timestep
+        level = self.level(flow)
+        if self._load is not None:
+            self._bend[:] = np.clip(-self._load / np.maximum(level, 1e-9), -1.0, 1.0)
+            self._load = None
+        inertia = self.scene.inertia[:n]
+        length = np.maximum(self.length(n), level * step**2 / (FIRMEST * inertia))
+        half = step / 2 / length
+        way, bend = np.sign(flow.velocity), self._bend[:n]
+        mean, kept = _half(np.abs(flow.velocity) * half)
+        middle = way + (bend - way) * kept
+        bend[:] = way + (middle - way) * kept
+        coming = np.maximum(np.abs(flow.coming) * half, HARDLY)
+        ahead, _ = _half(coming)
+        flow.torque -= level / 2 * (way + (middle - way) * mean + bend * ahead)
+        flow.damping += level / 2 * (1 - ahead) / coming * half
 
     def level(self, flow: Flow) -> Array:
         """Friction torque of a joint that slips, N m."""
@@ -47,6 +61,12 @@ class Friction(Term):
     def length(self, n: int) -> Array | float:
         """How far a joint gives before it slips, rad."""
         return GRIP
+
+
+def _half(slip: Array) -> tuple[Array, Array]:
+    """What a bend keeps of itself over a half sub-step's slip, in the mean and at its end."""
+    lost = np.expm1(-slip)
+    return np.where(slip > HARDLY, -lost / np.maximum(slip, HARDLY), 1 - slip / 2), 1 + lost
 
 
 class CoulombFriction(Friction):
