@@ -25,6 +25,9 @@ from pup.physics.parameters import ParameterSpace
 Array = NDArray[np.float64]
 
 STARTS, LANDED = 3, 2
+HORIZONS = (1.0, 2.5)
+"""Seconds of each recording that a first fit is made to, then a second one: with all of it at once,
+a start whose motion gets out of step settles anywhere."""
 FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
 """Frictions that a fit may start from on the ground."""
 SPREAD = 0.35
@@ -36,6 +39,8 @@ AGREEMENT = 3e-3
 than noise: where much is missing, a fit has many ends that lack it all the same."""
 EXCESS = 0.03
 ABSOLUTE = 5.0
+OTHER = 1.5
+"""A start that ends so far above a fit to the noise has ended elsewhere and says nothing of it."""
 SPARE = 0.02
 """Share of the noise that may be left by a fit that has stopped short."""
 SHORT = 0.06
@@ -124,6 +129,7 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     if not _agree(*fits):
         fits = [min(fits, key=lambda fit: fit.chi2)]
         fits.append(_nearby(fits[0], rng))
+        _begun(fits[1:], replays, noise)
         fit_together(fits, replays, noise)
     for width in WIDER:
         if _agree(*fits):
@@ -136,8 +142,9 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     if best.jacobian is None:
         differentiate([best], replays, noise)
     recovered, left = _refit_of_itself(best, replays, noise, rng)
-    if _noise_like(best):
-        left = max(left, second.chi2 - best.chi2)
+    apart, near = second.chi2 - best.chi2, SPARE * len(measured.values)
+    if apart < ((OTHER - 1) * best.chi2 if _noise_like(best) else near):
+        left = max(left, apart)
     starts, samples = (best.chi2, second.chi2), len(measured.values)
     return Nominal(best, noise, Certificate(starts, agreed, recovered, left, samples))
 
@@ -151,16 +158,36 @@ def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
     recordings = replays.measured.recordings
     air = [i for i, r in enumerate(recordings) if r.support != "ground"]
     if len(air) == len(recordings):
+        _begun(fits, replays, noise)
         return list(fits)
     if air:
         part = replays.narrowed(air)
-        moved = [Fit(fit.coordinates, fit.at, slack=fit.slack) for fit in fits]
-        fit_together(moved, part, noise)
+        _begun(fits, part, noise)
+        _moved(fits, part, noise)
         replays.simulated += part.simulated
-        for fit, found in zip(fits, moved, strict=True):
-            fit.at = found.at
     start_best(fits, [_floors(fit) for fit in fits], replays, noise)
     return sorted(fits, key=lambda fit: fit.chi2)[:LANDED]
+
+
+def _begun(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Fits brought near by how the recordings begin."""
+    time = replays.measured.time
+    for horizon in HORIZONS:
+        inside = time < horizon
+        if inside.any() and not inside.all():
+            _moved(fits, replays, noise, inside.astype(float))
+
+
+def _moved(
+    fits: Sequence[Fit], replays: Replays, noise: Noise, weight: Array | None = None
+) -> None:
+    """Fits that begin where others of theirs have ended."""
+    others = [
+        Fit(fit.coordinates, fit.at, weight=weight, data=fit.data, slack=fit.slack) for fit in fits
+    ]
+    fit_together(others, replays, noise)
+    for fit, found in zip(fits, others, strict=True):
+        fit.at = found.at
 
 
 def _floors(fit: Fit) -> list[Array]:
@@ -181,9 +208,9 @@ def _agree(first: Fit, second: Fit) -> bool:
     assert first.residual is not None
     least, apart = min(first.chi2, second.chi2), abs(first.chi2 - second.chi2)
     excess = least - len(first.residual)
-    if _noise_like(first) and _noise_like(second):
+    if _noise_like(min(first, second, key=lambda fit: fit.chi2)):
         return True
-    return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE)
+    return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE, SPARE * len(first.residual))
 
 
 def _noise_like(fit: Fit) -> bool:
@@ -224,11 +251,14 @@ def _refit_of_itself(
     # What the model leaves counts as noise here too: nothing is known better than that.
     misfit = max(1.0, fit.chi2 / len(replays.measured.values))
     deviation = np.sqrt(misfit * np.diag(fit.covariance()))
-    simulated, ends = replays([fit.row()])[0], []
+    simulated = replays([fit.row()])[0]
+    ends: list[tuple[float, float]] = []
     for _ in range(SELVES):  # a kink on the way says nothing of where the way leads
         away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
         start = _within(fit.coordinates, fit.at + away)
         own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1)
+        if ends:
+            _begun([own], replays, noise)
         fit_together([own], replays, noise, iterations=8)
         ends.append((float(np.max(np.abs(own.at - fit.at) / deviation)), own.chi2))
         if ends[-1][0] <= SELF or own.chi2 < SPARE * len(simulated):
