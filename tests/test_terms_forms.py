@@ -90,6 +90,19 @@ def test_friction_holds_up_to_its_level_at_rest() -> None:
             assert abs(KP * read[-1]) < level
 
 
+def test_what_holds_a_joint_at_rest_does_not_depend_on_the_batch() -> None:
+    """Of several terms that could hold, those that a simulation lacks hold nothing."""
+    run = held(0.0, 1.0, 0.016, setup=LIGHT)
+    rows = [
+        {f"coulomb_friction/torque{AT}": 0.1},
+        {f"stribeck_friction/torque{AT}": 0.1},
+        {f"integral_action/gain{AT}": 5.0},
+        {f"integral_action/gain{AT}": 5.0, f"stribeck_friction/torque{AT}": 0.1},
+    ]
+    for row, together in zip(rows, bench(run, *rows), strict=True):
+        assert np.array_equal(bench(run, row)[0], together)
+
+
 def test_presliding_is_a_spring_that_yields() -> None:
     """A virgin branch of Dahl's curve: kp (target - q) = level (1 - exp(-q / deflection))."""
     time = np.arange(0, 3, 0.02)

@@ -195,7 +195,8 @@ class IntegralAction(Term):
 
         A command that jumps at the start asks for more than any load: of that it knows nothing.
         """
-        own = np.where(np.abs(load) < SAG * np.abs(gravity), load, 0.0)
+        sags = (np.abs(load) < SAG * np.abs(gravity)) & (self.values["gain"] > 0)
+        own = np.where(sags, load, 0.0)
         self._sum += own / (self.values["gain"] + WEAK)
         return load - own
 

@@ -32,8 +32,10 @@ class Friction(Term):
 
     def held(self, load: Array, gravity: Array) -> Array:
         """See Term: a joint that is found at rest has its bristle bent by what it holds."""
-        self._load = load
-        return np.zeros_like(load)
+        sizes = [np.abs(self.values[q.name]) for q in self.quantities if not q.shape]
+        acts = np.asarray(sum(sizes)) > 0  # a batch has simulations without it, too
+        self._load = np.where(acts, load, 0.0)
+        return np.where(acts, 0.0, load)
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
@@ -108,6 +110,10 @@ class PreslidingHysteresis(Friction):
         Quantity("deflection", "rad", 0.006, 0.05, grid=(0.003, 0.008, 0.02)),
     )
     source = "estimate: a LuGre bristle gives 3 mrad before it slips"
+
+    def held(self, load: Array, gravity: Array) -> Array:
+        """See Term: what bends a bristle that gives is not known; it starts relaxed."""
+        return load
 
     def level(self, flow: Flow) -> Array:
         """See Friction."""
