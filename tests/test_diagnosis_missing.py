@@ -1,6 +1,5 @@
 """The report on what has no name: missing torques, halves of the data that differ, laws."""
 
-import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -207,12 +206,11 @@ def test_a_law_that_holds_is_told(leg: Maker, tmp_path: Path) -> None:
 
 
 def test_a_law_that_explains_little_is_not_said_to_describe_it(leg: Maker) -> None:
+    leg.rng = np.random.default_rng(2)  # whatever tests ran before
     told = leg.beyond(leg.nothing(2.0), KNEE, LAW)
     weak = replace(told.findings[0], gain=0.01 * told.findings[0].gain)
     words = sentence(told, weak, speech(told))
-    assert re.match(
-        f"{NAMELESS} at the left knee; the best law for it explains only [12][. ]", words
-    )
+    assert words.startswith(f"{NAMELESS} at the left knee; the best law for it explains only 2")
     assert "torque" not in words
 
 

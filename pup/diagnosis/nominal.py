@@ -35,8 +35,9 @@ SPREAD = 0.35
 NEAR = 0.1
 """Spread of a start around the best fit, where far ones disagree."""
 AGREEMENT = 3e-3
-"""Two starts agree in chi-squared to this share of it, to ABSOLUTE, or to EXCESS of what is more
-than noise: where much is missing, a fit has many ends that lack it all the same."""
+"""Two starts agree in chi-squared to this share of it, to ABSOLUTE, to SPARE of the noise, or to
+EXCESS of what is more than noise: where much is missing, a fit has many ends that lack it all the
+same."""
 EXCESS = 0.03
 ABSOLUTE = 5.0
 OTHER = 1.5
@@ -64,8 +65,8 @@ class Certificate:
       starts: chi-squared that the two best starts lead to.
       agree: whether they agree.
       recovered: largest error of a refit of its own simulation, in standard deviations.
-      left: chi-squared by which that refit stops short, and starts that fit to the noise: contact
-        has kinks on which a fit gets caught. What gains no more is no evidence.
+      left: chi-squared by which that refit stops short, and starts that end near each other or near
+        the noise: kinks and motions out of step catch a fit. What gains no more is no evidence.
       samples: number of samples.
     """
 
