@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pup.errors import InputError
 from pup.physics.rest import at_rest, ticks_at_rest
 from pup.physics.rotations import CONJUGATE, multiply
+from pup.physics.stopwatch import put_away
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.robot_stance import floor_normal
@@ -26,6 +27,7 @@ FLOOR = "floor"
 _log = mujoco.MjLogConfig.get()
 _log.logto_console = _log.logto_file = False
 _log.set()
+put_away()
 
 
 @dataclass(frozen=True)
