@@ -117,16 +117,21 @@ CASES = [
 ]
 
 
+def reveal(folder: Path, cases: Any) -> Path:
+    """Write a set under `set`, its `key.json` and the verdicts under `diagnoses`."""
+    (folder / "set").mkdir()
+    write_key(folder / "key.json", {"schema": 1, "salt": "ab", "cases": [c for c, _ in cases]})
+    commit(folder / "set", folder / "key.json", {"darwin_op2": len(cases)})
+    for truth, told in cases:
+        if told is not None:
+            write_json(folder / "diagnoses" / f"case_{truth['id']}" / "diagnosis.json", told)
+    return folder
+
+
 @pytest.fixture
 def revealed(tmp_path: Path) -> Path:
-    """A set under `set`, its `key.json` and the verdicts under `diagnoses`."""
-    (tmp_path / "set").mkdir()
-    write_key(tmp_path / "key.json", {"schema": 1, "salt": "ab", "cases": [c for c, _ in CASES]})
-    commit(tmp_path / "set", tmp_path / "key.json", {"darwin_op2": len(CASES)})
-    for truth, told in CASES:
-        if told is not None:
-            write_json(tmp_path / "diagnoses" / f"case_{truth['id']}" / "diagnosis.json", told)
-    return tmp_path
+    """The set of CASES."""
+    return reveal(tmp_path, CASES)
 
 
 def scored(folder: Path, **more: Any) -> dict[str, Any]:
@@ -172,8 +177,8 @@ def test_every_failure_is_listed(revealed: Path) -> None:
     }
 
 
-def test_among_equals_the_order_of_the_document_counts() -> None:
-    """A finding, then its equivalents, then the next one; names have no say."""
+def test_the_first_finding_is_first_and_the_others_go_by_probability() -> None:
+    """Among equals: a finding, then its equivalents, then the next one; names have no say."""
     told = verdict(
         "mismatch",
         finding(
@@ -184,9 +189,96 @@ def test_among_equals_the_order_of_the_document_counts() -> None:
         finding("clock_skew", BUS, 0.5, equivalents=[named("armature", KNEE, 0.2)]),
     )
     assert [n.effect for n in ranking(told)] == [
-        *("payload", "quadratic_damping", "torque_speed_limit", "backlash"),
+        *("quadratic_damping", "payload", "torque_speed_limit", "backlash"),
         *("clock_skew", "armature"),
     ]
+    assert ranking(verdict("none")) == []
+
+
+def test_unknown_is_first_where_more_is_believed_in_it() -> None:
+    friction = finding("coulomb_friction", KNEE, 0.4, equivalents=[named("cogging", KNEE, 0.45)])
+    payload = finding("payload", KNEE, 0.9)
+
+    def first(probability: float) -> str:
+        told = verdict("mismatch", friction, payload, finding("unknown", KNEE, probability))
+        return ranking(told)[0].effect
+
+    assert [first(p) for p in (0.39, 0.4, 0.41)] == ["coulomb_friction"] * 2 + ["unknown"]
+    within = verdict("mismatch", friction | {"equivalents": [named("unknown", KNEE, 0.6)]})
+    assert ranking(within)[0].effect == "coulomb_friction"
+
+
+def test_scores_go_by_the_first_finding_not_by_the_most_probable(tmp_path: Path) -> None:
+    """Stribeck friction at 0.80 stands before clock skew at 0.82."""
+    told = verdict(
+        "mismatch",
+        finding(
+            *("stribeck_friction", KNEE, 0.8),
+            equivalents=[named("coulomb_friction", KNEE, 0.11)],
+        ),
+        finding("clock_skew", BUS, 0.82),
+    )
+    truths = (
+        case("f", "single", effect("stribeck_friction", KNEE)),
+        case("g", "single", effect("clock_skew", BUS)),
+    )
+    scores = scored(reveal(tmp_path, [(truth, told) for truth in truths]))["all"]
+    assert scores["exact_top1"]["hits"] == scores["class_top1"]["hits"] == 1
+    assert scores["exact_top3"]["hits"] == scores["class_top3"]["hits"] == 2
+    # f 1; g 1/2, for the knee is on the bus
+    assert scores["place_top1"]["mean"] == 0.75
+    # f .91 right, g .91 wrong
+    assert scores["calibration"]["brier"] == pytest.approx((0.09**2 + 0.91**2) / 2)
+
+
+NUISANCE = [effect("cogging", HIP), effect("command_delay", BUS, 0.001, "s")]
+
+
+def test_nuisances_that_are_there_have_rows_beside_the_strict_ones(tmp_path: Path) -> None:
+    """Cogging at the hip is there, cogging at the other hip is not; delay is there at any joint."""
+    friction = finding("coulomb_friction", KNEE, 0.3)
+
+    def single(name: str, first: Any) -> Any:
+        truth = case(name, "single", effect("coulomb_friction", KNEE), nuisance=NUISANCE)
+        return truth, verdict("mismatch", first, friction)
+
+    calm = {"material": False, "held_out_gain_sigma": 0.2489, "when": []}
+    cases = [
+        single("p", finding("cogging", HIP, 0.9)),
+        single("q", finding("cogging", place("joint", "r_hip_pitch"), 0.9)),
+        single("r", finding("measurement_delay", KNEE, 0.9)),
+        single("s", finding("stribeck_friction", KNEE, 0.9)),
+        (
+            case("n", "null:nuisance", nuisance=NUISANCE, all_seen=calm),
+            verdict("mismatch", finding("cogging", HIP, 0.9)),
+        ),
+    ]
+    scores = scored(reveal(tmp_path, cases))
+    everything = scores["all"]
+    assert (everything["class_top1"]["hits"], everything["class_top1"]["of"]) == (1, 4)
+    either = everything["class_top1_or_nuisance"]
+    assert (either["hits"], either["of"]) == (3, 4)
+    # p 0, q 0, r 1, s 1; with nuisances p 1
+    assert everything["place_top1"]["mean"] == 0.5
+    assert everything["place_top1_or_nuisance"]["mean"] == 0.75
+    assert everything["calibration"]["ece"] == pytest.approx(0.65)
+    assert everything["calibration_or_nuisance"]["ece"] == pytest.approx(0.15)
+    assert scores["calibration"]["ece"] == pytest.approx(0.9 - 1 / 5)
+    assert scores["calibration_or_nuisance"]["ece"] == pytest.approx(0.9 - 4 / 5)
+    assert scores["nulls"]["false_positives"]["hits"] == 1
+    assert {f["case"]: f["faults"] for f in scores["failures"]} == {
+        "p": ["wrong class (a nuisance that is there)", "wrong place"],
+        "q": ["wrong class", "wrong place"],
+        "r": ["wrong class (a nuisance that is there)"],
+        "s": ["wrong effect of the class"],
+        "n": ["false positive (nuisance of 0.25 sigma)"],
+    }
+
+
+def test_without_a_nuisance_both_readings_are_one(revealed: Path) -> None:
+    everything = scored(revealed)["all"]
+    for name in ("class_top1", "place_top1", "calibration"):
+        assert everything[f"{name}_or_nuisance"] == everything[name]
 
 
 def test_calibration_over_the_cases_that_name_something(revealed: Path) -> None:
@@ -233,6 +325,7 @@ def test_the_command_writes_scores_and_a_table(revealed: Path) -> None:
     assert "| detected | 0.67 (4/6) |" in table
     assert "| false positives | 0.50 (1/2) |" in table
     assert table.count("no diagnosis") == 1
+    assert "| class, first, nuisances that are there counted as true | 0.60 (3/5) |" in table
     assert json.loads((revealed / "scores.json").read_text())["all"]["detected"]["hits"] == 4
 
 

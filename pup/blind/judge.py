@@ -14,15 +14,25 @@ from pup.robot import RobotDescription
 SHARP = 0.8  # probability from which a single name counts as a sharp claim
 PER_SECOND = 100  # resolution in which spans of time are compared
 WHOLE = ("bus", "robot")  # places that cover all joints
+CALM = "null:nuisance"  # the nulls that have a nuisance
+UNKNOWN = "unknown"  # what a finding outside the list is called
 
 
 @dataclass(frozen=True)
 class Named:
-    """One explanation in a diagnosis: a finding or one of its equivalents."""
+    """One explanation in a diagnosis: a finding or one of its equivalents.
+
+    Attributes:
+      effect: its name.
+      place: as in the document.
+      probability: of it.
+      finding: index of the finding it belongs to.
+    """
 
     effect: str
     place: Mapping[str, Any]
     probability: float
+    finding: int
 
 
 @dataclass(frozen=True)
@@ -35,11 +45,14 @@ class Judged:
       stratum: of the case.
       null: whether nothing is missing.
       excused: whether it is a null whose nuisance is material.
+      nuisance: what a complete model of a null's nuisance gains, in units of sigma.
       verdict: the diagnosis's, or `missing`.
       exact: rank of the first right effect, from 1.
       kind: rank of the first right class, from 1.
       all_found: whether every effect's class stands among the first three.
       place: credit for the place that is named first, 0 to 1.
+      background: whether what stands first is a nuisance that is there, by class and place.
+      place_background: as `place`, such a nuisance's place counted as right.
       covered: whether the first finding and its equivalents hold the truth.
       size: how many effects those are.
       sharp: whether a single effect is claimed with confidence.
@@ -62,10 +75,13 @@ class Judged:
     null: bool
     excused: bool
     verdict: str
+    nuisance: float | None = None
     exact: int | None = None
     kind: int | None = None
     all_found: bool | None = None
     place: float | None = None
+    background: bool = False
+    place_background: float | None = None
     covered: bool | None = None
     size: int | None = None
     sharp: bool = False
@@ -83,16 +99,26 @@ class Judged:
 
 
 def ranking(diagnosis: Mapping[str, Any]) -> list[Named]:
-    """Findings and their equivalents by probability; among equals, as they stand in the document.
+    """Findings and their equivalents: what is claimed first, then all others by probability.
 
-    There the more important finding stands first, and each before its equivalents.
+    First is the first finding, for findings stand most important first (contract, section 5); a
+    finding `unknown` is where it is more probable than that one. Among equals the others stay as
+    they stand in the document, each finding before its equivalents.
     """
-    named = [
-        Named(str(e["effect"]), e["place"], float(e["probability"]))
-        for finding in diagnosis.get("findings", [])
-        for e in (finding, *finding.get("equivalents", []))
+    groups = [
+        [
+            Named(str(e["effect"]), e["place"], float(e["probability"]), index)
+            for e in (finding, *finding.get("equivalents", []))
+        ]
+        for index, finding in enumerate(diagnosis.get("findings", []))
     ]
-    return sorted(named, key=lambda n: -n.probability)
+    if not groups:
+        return []
+    heads = [group[0] for group in groups]
+    rivals = [head for head in heads if head.effect == UNKNOWN]
+    first = max([heads[0], *rivals], key=lambda n: n.probability)
+    others = [n for group in groups for n in group if n is not first]
+    return [first, *sorted(others, key=lambda n: -n.probability)]
 
 
 def judge(
@@ -110,13 +136,14 @@ def judge(
       oracle: share of the possible gain on the test motions that was had.
     """
     null = str(truth["stratum"]).startswith("null:")
-    material = bool((truth.get("all_seen") or {}).get("material"))
+    seen = truth.get("all_seen") or {}
     case: dict[str, Any] = {
         "id": truth["id"],
         "robot": truth["robot"],
         "stratum": truth["stratum"],
         "null": null,
-        "excused": null and material,
+        "excused": null and bool(seen.get("material")),
+        "nuisance": seen.get("held_out_gain_sigma") if truth["stratum"] == CALM else None,
     }
     if diagnosis is None:
         return Judged(**case, verdict="missing")
@@ -124,13 +151,15 @@ def judge(
     findings = diagnosis.get("findings", [])
     group = _group(findings)
     verdict = str(diagnosis.get("verdict"))
+    background = _background(robot, named, truth.get("nuisance", []))
     case |= {
         "verdict": verdict,
         "size": len(group) or None,
-        "sharp": len(group) == 1 and named[0].probability >= SHARP if named else False,
+        "sharp": len(group) == 1 and max(n.probability for n in named) >= SHARP,
         "allowed": verdict in truth["answer"]["verdicts"],
-        "unknown": any(n.effect == "unknown" for n in named) or any(f.get("law") for f in findings),
-        "confidence": _confidence(findings),
+        "unknown": any(n.effect == UNKNOWN for n in named) or any(f.get("law") for f in findings),
+        "confidence": _confidence(named),
+        "background": bool(background),
         "ambiguous": verdict == "undetermined" or len(group) > 1,
         "next": diagnosis.get("next_recording") is not None,
         "seconds": _seconds(diagnosis),
@@ -143,14 +172,15 @@ def judge(
     wanted = {str(e["effect"]) for e in effects}
     accepted = wanted | {b for e in effects for b in e["besides"]}
     classes = {CLASS_OF[e] for e in accepted if e in CLASS_OF}
-    kinds = [CLASS_OF.get(n.effect, n.effect) for n in named]
+    kinds = [_class(n.effect) for n in named]
     first = list(dict.fromkeys(kinds))[:3]
     answers = set(truth["answer"]["set"])
     case |= {
         "exact": _rank([n.effect for n in named], wanted),
         "kind": _rank(kinds, classes or wanted),
         "all_found": all(_classes_of(e) & set(first) for e in effects),
-        "place": max((_credit(robot, named[0], e) for e in effects), default=0.0) if named else 0.0,
+        "place": _placed(robot, named, effects),
+        "place_background": _placed(robot, named, [*effects, *background]),
         "covered": answers <= group if answers and group else bool(group & accepted),
         "regime": _regime(truth, findings),
     }
@@ -165,19 +195,28 @@ def _group(findings: Sequence[Mapping[str, Any]]) -> set[str]:
     return {str(e["effect"]) for e in (findings[0], *findings[0].get("equivalents", []))}
 
 
-def _confidence(findings: Sequence[Mapping[str, Any]]) -> float | None:
+def _confidence(named: Sequence[Named]) -> float | None:
     """Probability of the class that is named first, its members in the same finding added up."""
-    best: tuple[float, float] | None = None
-    for finding in findings:
-        members = [
-            (float(e["probability"]), CLASS_OF.get(e["effect"], e["effect"]))
-            for e in (finding, *finding.get("equivalents", []))
-        ]
-        top, kind = max(members, key=lambda member: member[0])
-        total = min(1.0, sum(p for p, k in members if k == kind))
-        if best is None or top > best[0]:
-            best = (top, total)
-    return None if best is None else best[1]
+    if not named:
+        return None
+    first = named[0]
+    members = [n for n in named if n.finding == first.finding]
+    return min(1.0, sum(n.probability for n in members if _class(n.effect) == _class(first.effect)))
+
+
+def _background(
+    robot: RobotDescription, named: Sequence[Named], nuisance: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """The nuisances that the first name tells of: of its class, at a place that meets its own."""
+    if not named:
+        return []
+    first = named[0]
+    told = _where(robot, first.place)
+    return [
+        n
+        for n in nuisance
+        if _class(n["effect"]) == _class(first.effect) and told & _where(robot, n["place"])
+    ]
 
 
 def _rank(named: Sequence[str], right: set[str]) -> int | None:
@@ -187,7 +226,19 @@ def _rank(named: Sequence[str], right: set[str]) -> int | None:
 
 
 def _classes_of(effect: Mapping[str, Any]) -> set[str]:
-    return {CLASS_OF.get(e, e) for e in (effect["effect"], *effect["besides"])}
+    return {_class(e) for e in (effect["effect"], *effect["besides"])}
+
+
+def _class(effect: str) -> str:
+    """The class of an effect; what is not on the list is one of its own."""
+    return CLASS_OF.get(effect, effect)
+
+
+def _placed(
+    robot: RobotDescription, named: Sequence[Named], effects: Sequence[Mapping[str, Any]]
+) -> float:
+    """Credit for the place that is named first, by the effect that it fits best."""
+    return max((_credit(robot, n, e) for n in named[:1] for e in effects), default=0.0)
 
 
 def _credit(robot: RobotDescription, named: Named, effect: Mapping[str, Any]) -> float:

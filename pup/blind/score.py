@@ -15,6 +15,7 @@ from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription
 
 TOP = 3
+THERE = " (a nuisance that is there)"
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,6 @@ def score_set(
                 f"{place / 'diagnosis.json'}: does not follow the contract ({error!r})"
             ) from error
     real = [case for case in judged if not case.null]
-    claims = [case for case in judged if case.confidence is not None and not case.excused]
     strata = sorted({case.stratum for case in judged})
     return {
         "schema": 1,
@@ -96,10 +96,7 @@ def score_set(
             | {"nulls": _nulls([c for c in judged if c.null and c.robot == name])}
             for name in sorted(robots)
         },
-        "calibration": calibration(
-            [c.confidence for c in claims if c.confidence is not None],
-            [c.kind == 1 for c in claims],
-        ),
+        **_calibrations(judged),
         "failures": [_failure(case) for case in judged if _faults(case)],
     }
 
@@ -110,15 +107,18 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
     open_ = [c for c in cases if c.stratum == "unidentifiable"]
     grouped = [c for c in cases if c.size is not None]
     unclear = [c for c in cases if c.ambiguous]
-    claims = [c for c in cases if c.confidence is not None]
     return {
         "detected": share([c.verdict == "mismatch" for c in cases if c not in open_]),
         "exact_top1": share([c.exact == 1 for c in listed]),
         "exact_top3": share([_within(c.exact) for c in listed]),
         "class_top1": share([c.kind == 1 for c in listed]),
+        "class_top1_or_nuisance": share([_true(c) for c in listed]),
         "class_top3": share([_within(c.kind) for c in listed]),
         "pairs_both_in_top3": share([bool(c.all_found) for c in cases if c.stratum == "pair"]),
         "place_top1": mean([c.place for c in listed if c.place is not None]),
+        "place_top1_or_nuisance": mean(
+            [c.place_background for c in listed if c.place_background is not None]
+        ),
         "set_covers": share([bool(c.covered) for c in grouped]),
         "set_size": mean([float(c.size) for c in grouped if c.size is not None]),
         "regime_f1": mean([c.regime for c in cases if c.regime is not None]),
@@ -129,10 +129,7 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
         "listed_flagged_unknown": share([c.unknown for c in listed]),
         "ambiguous_with_next_recording": share([c.next for c in unclear]),
         "oracle_ratio": mean([c.oracle for c in cases if c.oracle is not None]),
-        "calibration": calibration(
-            [c.confidence for c in claims if c.confidence is not None],
-            [c.kind == 1 for c in claims],
-        ),
+        **_calibrations(cases),
         "seconds": mean([c.seconds for c in cases if c.seconds is not None]),
     }
 
@@ -149,6 +146,21 @@ def _nulls(cases: Sequence[Judged]) -> dict[str, Any]:
     }
 
 
+def _calibrations(cases: Sequence[Judged]) -> dict[str, Any]:
+    """How far the probability of the class named first can be trusted, in both readings."""
+    claims = [c for c in cases if c.confidence is not None and not c.excused]
+    told = [c.confidence for c in claims if c.confidence is not None]
+    return {
+        "calibration": calibration(told, [c.kind == 1 for c in claims]),
+        "calibration_or_nuisance": calibration(told, [_true(c) for c in claims]),
+    }
+
+
+def _true(case: Judged) -> bool:
+    """Whether the class named first is there, as an omission or as a nuisance."""
+    return case.kind == 1 or case.background
+
+
 def _within(rank: int | None) -> bool:
     return rank is not None and rank <= TOP
 
@@ -158,7 +170,7 @@ def _faults(case: Judged) -> list[str]:
     if case.verdict == "missing":
         return ["no diagnosis"]
     if case.null:
-        return ["false positive"] if case.verdict == "mismatch" and not case.excused else []
+        return [_alarm(case)] if case.verdict == "mismatch" and not case.excused else []
     if case.stratum == "unidentifiable":
         faults = [] if case.allowed else [f"verdict {case.verdict}"]
         return faults + ["sharp name where the data cannot tell"] * case.sharp
@@ -166,12 +178,19 @@ def _faults(case: Judged) -> list[str]:
         return [] if case.allowed else ["missed"]
     if case.stratum == "unlisted":
         return [] if case.unknown else ["not told to be outside the list"]
-    faults = [] if case.kind == 1 else ["wrong class"]
+    faults = [] if case.kind == 1 else ["wrong class" + THERE * case.background]
     if case.kind == 1 and case.exact != 1:
         faults.append("wrong effect of the class")
     if case.stratum == "pair" and not case.all_found:
         faults.append("one of two found")
     return faults + ["wrong place"] * (case.place is not None and case.place < 1)
+
+
+def _alarm(case: Judged) -> str:
+    """A false positive, with what a complete model of the nuisance would gain."""
+    if case.nuisance is None:
+        return "false positive"
+    return f"false positive (nuisance of {case.nuisance:.2f} sigma)"
 
 
 def _failure(case: Judged) -> dict[str, Any]:

@@ -3,14 +3,17 @@
 from collections.abc import Mapping
 from typing import Any
 
+EITHER = "nuisances that are there counted as true"
 ROWS = {
     "detected": "detected",
     "exact_top1": "exact effect, first",
     "exact_top3": "exact effect, first three",
     "class_top1": "class, first",
+    "class_top1_or_nuisance": f"class, first, {EITHER}",
     "class_top3": "class, first three",
     "pairs_both_in_top3": "pairs: both classes in the first three",
     "place_top1": "place, first (mirror: half)",
+    "place_top1_or_nuisance": f"place, first, {EITHER}",
     "set_covers": "equivalence set holds the truth",
     "set_size": "size of that set",
     "regime_f1": "times at which it acts, F1",
@@ -22,6 +25,7 @@ ROWS = {
     "ambiguous_with_next_recording": "ambiguous: next recording proposed",
     "oracle_ratio": "oracle ratio on test motions",
     "calibration": "calibration of the class",
+    "calibration_or_nuisance": f"calibration of the class, {EITHER}",
     "seconds": "seconds per diagnosis",
 }
 NULL_ROWS = {
