@@ -45,6 +45,18 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
     )
 
 
+def beginning(recording: Recording, until: float) -> Recording:
+    """The recording up to some time after its start, s; two rows of it at least."""
+    kept = max(FEWEST, int(np.sum(recording.time - recording.time[0] < until)))
+    return replace(
+        recording,
+        time=recording.time[:kept],
+        target=recording.target[:kept],
+        position=recording.position[:kept],
+        extras={name: values[:kept] for name, values in recording.extras.items()},
+    )
+
+
 def thinned(recording: Recording, every: int) -> Recording:
     """A recording with one in so many readings of position; all commands stay.
 

@@ -128,10 +128,12 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
     if not _agree(*fits):
-        fits = [min(fits, key=lambda fit: fit.chi2)]
-        fits.append(_nearby(fits[0], rng))
-        _begun(fits[1:], replays, noise)
+        best = min(fits, key=lambda fit: fit.chi2)
+        others = [_nearby(best, rng) for _ in range(2)]
+        _begun(others[1:], replays, noise)  # how recordings begin may lead to it, or away
+        fits = [best, *others]
         fit_together(fits, replays, noise)
+        fits = sorted(fits, key=lambda fit: fit.chi2)[:2]
     for width in WIDER:
         if _agree(*fits):
             break
@@ -164,7 +166,7 @@ def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
     if air:
         part = replays.narrowed(air)
         _begun(fits, part, noise)
-        _moved(fits, part, noise)
+        _moved(fits, part, noise, replays.measured.only(air))
         replays.simulated += part.simulated
     start_best(fits, [_floors(fit) for fit in fits], replays, noise)
     return sorted(fits, key=lambda fit: fit.chi2)[:LANDED]
@@ -176,15 +178,21 @@ def _begun(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     for horizon in HORIZONS:
         inside = time < horizon
         if inside.any() and not inside.all():
-            _moved(fits, replays, noise, inside.astype(float))
+            part = replays.shortened(horizon)
+            _moved(fits, part, noise, inside)
+            replays.simulated += round(inside.mean() * part.simulated)
 
 
-def _moved(
-    fits: Sequence[Fit], replays: Replays, noise: Noise, weight: Array | None = None
-) -> None:
-    """Fits that begin where others of theirs have ended."""
+def _moved(fits: Sequence[Fit], replays: Replays, noise: Noise, part: NDArray[np.bool_]) -> None:
+    """Fits that begin where others of theirs have ended, on the part that is replayed."""
     others = [
-        Fit(fit.coordinates, fit.at, weight=weight, data=fit.data, slack=fit.slack) for fit in fits
+        Fit(
+            fit.coordinates,
+            fit.at,
+            slack=fit.slack,
+            data=None if (d := fit.data) is None else d[part],
+        )
+        for fit in fits
     ]
     fit_together(others, replays, noise)
     for fit, found in zip(fits, others, strict=True):

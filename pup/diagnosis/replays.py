@@ -16,6 +16,7 @@ from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import Candidates, ParameterSpace
 from pup.physics.push import Push
 from pup.physics.terms import Place, split_column, term_space
+from pup.recording_cuts import beginning
 
 Array = NDArray[np.float64]
 Row = Mapping[str, float]
@@ -36,12 +37,14 @@ class Batch:
       candidates: their parameters.
       recordings: which recordings are replayed.
       push: torques from outside.
+      until: how much of each recording is replayed, s; all where it is None.
     """
 
     rows: NDArray[np.int64]
     candidates: Candidates
     recordings: tuple[int, ...]
     push: Push | None = None
+    until: float | None = None
 
 
 @dataclass(eq=False)
@@ -55,23 +58,32 @@ class Bench:
 
     measured: Measured
     actuator: str = "pd"
-    _simulators: dict[tuple[int, ...], tuple[MujocoSimulator, Measured]] = field(
-        default_factory=dict, repr=False
+    _simulators: dict[tuple[tuple[int, ...], float | None], tuple[MujocoSimulator, Measured]] = (
+        field(default_factory=dict, repr=False)
     )
 
     def run(self, batch: Batch) -> Array:
         """Samples of a batch, shape (n_rows, n_samples of its recordings), rad."""
-        simulator, measured = self.simulator(batch.recordings)
+        simulator, measured = self.simulator(batch.recordings, batch.until)
         return measured.pick(simulator.replay(batch.candidates, batch.push))
 
-    def simulator(self, recordings: tuple[int, ...]) -> tuple[MujocoSimulator, Measured]:
-        """The simulator of some recordings and their samples."""
-        if recordings not in self._simulators:
-            chosen = [self.measured.recordings[i] for i in recordings]
-            part = Measured.of(self.measured.robot, chosen)
+    def simulator(
+        self, recordings: tuple[int, ...], until: float | None
+    ) -> tuple[MujocoSimulator, Measured]:
+        """The simulator of some recordings, or of how they begin, and their samples."""
+        if (recordings, until) not in self._simulators:
+            part = some(self.measured, recordings, until)
             simulator = MujocoSimulator(part.robot, part.recordings, self.actuator)
-            self._simulators[recordings] = simulator, part
-        return self._simulators[recordings]
+            self._simulators[recordings, until] = simulator, part
+        return self._simulators[recordings, until]
+
+
+def some(measured: Measured, recordings: Sequence[int], until: float | None) -> Measured:
+    """The samples of some recordings, or of how they begin."""
+    chosen = [measured.recordings[i] for i in recordings]
+    if until is not None:
+        chosen = [beginning(recording, until) for recording in chosen]
+    return Measured.of(measured.robot, chosen)
 
 
 Runner = Callable[[Sequence[Batch]], list[Array]]
@@ -83,7 +95,7 @@ def threads(bench: Bench, count: int) -> Runner:
 
     def run(batches: Sequence[Batch]) -> list[Array]:
         for batch in batches:
-            bench.simulator(batch.recordings)
+            bench.simulator(batch.recordings, batch.until)
         with ThreadPoolExecutor(count) as pool:
             return list(pool.map(bench.run, batches))
 
@@ -147,15 +159,22 @@ class Replays:
 
     def narrowed(self, recordings: Sequence[int]) -> "Replays":
         """Replays of some of the recordings, as if there were no others."""
-        chosen = [self.measured.recordings[i] for i in recordings]
 
         def run(batches: Sequence[Batch]) -> list[Array]:
             return self.runner(
                 [replace(b, recordings=tuple(recordings[i] for i in b.recordings)) for b in batches]
             )
 
-        part = Measured.of(self.measured.robot, chosen)
-        return Replays(part, self.space, run, self.lanes)
+        return Replays(some(self.measured, recordings, None), self.space, run, self.lanes)
+
+    def shortened(self, until: float) -> "Replays":
+        """Replays of how the recordings begin, up to some time."""
+
+        def run(batches: Sequence[Batch]) -> list[Array]:
+            return self.runner([replace(b, until=until) for b in batches])
+
+        every = range(len(self.measured.recordings))
+        return Replays(some(self.measured, every, until), self.space, run, self.lanes)
 
     def _run(self, calls: Sequence[tuple[list[Batch], int]]) -> list[Array]:
         answers = iter(self.runner([batch for batches, _ in calls for batch in batches]))
