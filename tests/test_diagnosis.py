@@ -63,6 +63,15 @@ def test_nothing_is_found_where_nothing_is_missing(seed: int) -> None:
     assert told.nominal.certificate.holds
 
 
+def test_what_is_small_and_predicts_little_is_no_mismatch() -> None:
+    """Every robot has a little of everything; it shows, but nothing material is missing."""
+    told = found({f"command_delay/time@{SERVO}": 0.0006})
+    assert told.verdict == "none"
+    assert "not material" in told.reason
+    assert not told.findings
+    assert told.model is not None and not told.model.hypotheses
+
+
 def test_what_cannot_be_told_apart_is_told_together() -> None:
     """Late commands and late readings are the same thing to a servo that starts at rest."""
     told = found({f"command_delay/time@{SERVO}": 0.012})

@@ -12,6 +12,7 @@ from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
+from pup.diagnosis.materiality import GAIN, SMALL, improves, matters
 from pup.diagnosis.nominal import Nominal, fit_nominal
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.regimes import Regime, regimes
@@ -49,7 +50,7 @@ class Diagnosis:
     Attributes:
       robot: the robot.
       verdict: whether something material is missing.
-      reason: why, where nothing can be said; empty else.
+      reason: why nothing can be said, or what was found and does not matter; else empty.
       measured: the samples.
       nominal: the nominal fit.
       findings: what is missing, most important first.
@@ -156,9 +157,12 @@ def diagnose(
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
     shown = held_out(measured, selector.nominal, final, seed)
-    if left and not model.hypotheses and not _convinces(left, shown):
-        left, final = None, selector.predicting(model)
-        shown = held_out(measured, selector.nominal, final, seed)
+    little = ""
+    if not _matters(model, left, shown, nominal.noise):
+        little = _little(model, shown)
+        left, model = None, selector.nominal
+        final = model
+        shown = held_out(measured, model, model, seed)
     evidence: dict[str, Any] = {
         "found": done.found,
         "enough": done.enough,
@@ -169,7 +173,7 @@ def diagnose(
         "unexplained": left,
     }
     if not model.hypotheses and not left:
-        return told("none", **evidence)
+        return told("none", little, **evidence)
     progress("where", 0.87)
     differentiate([final.fit], replays, nominal.noise)
     evidence["missing"] = missing_input(nominal.fit, replays, nominal.noise)
@@ -214,9 +218,31 @@ def _weighed(
     return nominal, search(replays, nominal, rng, progress, first[1] if first else None)
 
 
-def _convinces(left: Unexplained, shown: HeldOut) -> bool:
-    """Whether something unknown alone makes a mismatch: it is large, or its law predicts."""
-    return shown.interval[0] > 0 or max(lack.excess for lack in left.lacks) > ALONE
+def _matters(model: Model, left: Unexplained | None, shown: HeldOut, noise: Noise) -> bool:
+    """Whether what was found is material, or something unknown: that is large, or predicted."""
+    if model.hypotheses and matters(model, shown, noise):
+        return True
+    if left is None:
+        return False
+    if max(lack.excess for lack in left.lacks) > ALONE:
+        return True
+    if model.hypotheses:
+        return improves(shown, noise, model.measured.robot)
+    return shown.interval[0] > 0
+
+
+def _little(model: Model, shown: HeldOut) -> str:
+    """What was found and does not matter, in words; empty where nothing was."""
+    if not model.hypotheses:
+        return ""
+    found = ", ".join(f"{h.effect} at {h.place}" for h in model.hypotheses)
+    why = "predicts motions left out no better"
+    if shown.after < shown.before:
+        why = (
+            f"is below {SMALL:g} of its typical size and lowers no joint's error on motions left "
+            f"out by {GAIN:g} of its noise"
+        )
+    return f"found, but not material: {found}, which {why}"
 
 
 def _first_look(

@@ -21,6 +21,7 @@ from pup.diagnosis import (
 from pup.diagnosis.drawing import draw_robot
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS, WORDS
+from pup.diagnosis.materiality import SMALL
 from pup.diagnosis.report_findings import badge, otherwise
 from pup.diagnosis.rivals import Rivals
 from pup.diagnosis.sentences import items
@@ -189,11 +190,21 @@ class _Report:
         """What it means that nothing is missing."""
         diagnosis = self.diagnosis
         tried = counted(len({t.hypothesis.key for t in diagnosis.found}), "combination")
-        yield (
-            f"Of {tried} of effect and place none explains an error of more than "
-            f"{self.error(summary.smallest_material(diagnosis))} on motions left out of the fit. "
-            "An effect that these motions do not excite may still be missing."
-        )
+        slight = [r.chosen for r in diagnosis.rounds if r.accepted]
+        if slight:
+            named = listed([self.speech.words(h.effect, h.place) for h in slight])
+            yield (
+                f"Of {tried} of effect and place these motions show {named}, but too little to "
+                f"matter: below {SMALL:.0%} of what is typical, or of no use in predicting motions "
+                "left out of the fit. So nothing was added to the corrected robot."
+            )
+        else:
+            yield (
+                f"Of {tried} of effect and place none explains an error of more than "
+                f"{self.error(summary.smallest_material(diagnosis))} on motions left out of the "
+                "fit."
+            )
+        yield "An effect that these motions do not excite may still be missing."
         if self.left() > LEFT:
             yield (
                 "But what is left is too much for noise: its cause is none of the effects "
@@ -205,7 +216,7 @@ class _Report:
                 "With its parameters refitted, the simulator as it is will do for motions like "
                 "these."
             )
-        if diagnosis.rounds and diagnosis.rounds[-1].finalists:
+        if not slight and diagnosis.rounds and diagnosis.rounds[-1].finalists:
             closest = diagnosis.rounds[-1]
             named = self.speech.words(closest.chosen.effect, closest.chosen.place)
             yield f"Closest was {named}; {summary.why_rejected(closest, self.diagnosis)}."
