@@ -12,7 +12,14 @@ from pup.diagnosis.evidence import Projector, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Coordinate, Fit, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.replays import Batch, Bench, Replays, threads
-from pup.diagnosis.residuals import Measured, Noise, noise_floor, quiet_noise, steady_start
+from pup.diagnosis.residuals import (
+    Measured,
+    Noise,
+    noise_floor,
+    quanta,
+    quiet_noise,
+    steady_start,
+)
 from pup.diagnosis.store import Store
 from pup.diagnosis.tracing import traces
 from pup.physics.parameters import robot_space
@@ -220,3 +227,21 @@ def test_what_was_replayed_is_not_replayed_again(tmp_path: Path) -> None:
     assert asked[-1] == 1
     store.clear()
     assert not (tmp_path / "kept").exists()
+
+
+def test_a_coarse_encoder_at_rest_is_not_believed_to_be_exact() -> None:
+    """What always tells the same value is known to a step of it, not exactly."""
+    step = 2 * np.pi / 4096
+    runs = tuple(
+        replace(r, position=np.round(r.position / step) * step, repeat_of=None)
+        for r in recordings({}, noise=0.0)
+    )
+    measured = Measured.of(BENCH, runs)
+    assert quanta(measured)[0] == pytest.approx(step, rel=1e-2)
+    floor = noise_floor(measured, np.zeros_like(measured.values))
+    assert floor.sigma[0] >= 0.99 * step / np.sqrt(12)
+    fine = Measured.of(BENCH, recordings({}, noise=0.002))
+    smooth = replace(
+        fine, values=fine.values + np.random.default_rng(0).normal(0, 0.002, len(fine.values))
+    )
+    assert quanta(smooth)[0] == 0.0

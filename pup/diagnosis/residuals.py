@@ -42,6 +42,10 @@ FEWEST_BLOCKS = 8
 """Blocks of a channel below which they tell nothing of its noise."""
 QUIET = 2.5
 """Blocks with more than so many times the usual mean square are not noise alone."""
+DIGITS = 6
+"""Decimals of a radian that readings are told apart by."""
+ON_GRID, MOSTLY = 0.1, 0.9
+"""Readings are quantised where so many of them lie within this share of a step of a grid."""
 LOST = 3.0
 """Error counted for a simulation that broke down, rad."""
 
@@ -230,7 +234,8 @@ def _pooled(
 ) -> Noise:
     """Channels that say nothing take the median of their kind; one kind shares its correlation."""
     joints = len(measured.robot.joints)
-    noise, least = assumed_noise(measured), LEAST * Scale.of(measured.robot).angle
+    noise = assumed_noise(measured)
+    least = np.maximum(LEAST * Scale.of(measured.robot).angle, quanta(measured) / np.sqrt(12))
     sigma, rho = noise.sigma.copy(), noise.rho.copy()
     for kind in (range(joints), range(joints, joints + 2)):
         known = [told[c] for c in kind if c in told]
@@ -241,9 +246,30 @@ def _pooled(
         for channel in kind:
             own = told.get(channel, (middle, shared))[0]
             # One channel's few samples say less than all of its kind together.
-            sigma[channel] = max(least, np.sqrt((own**2 + middle**2) / 2))
+            sigma[channel] = max(least[channel], np.sqrt((own**2 + middle**2) / 2))
             rho[channel] = shared
     return Noise(sigma, rho, source, readings)
+
+
+def quanta(measured: Measured) -> Array:
+    """Steps that the channels are read in, shape (n_channels,), rad; 0 where they have none.
+
+    A coarse encoder at rest tells the same value again and again, which is not to know it exactly.
+    """
+    steps = np.zeros(measured.channels)
+    for channel in np.unique(measured.channel):
+        values = measured.values[measured.channel == channel]
+        gaps = np.diff(np.unique(np.round(values, DIGITS)))
+        if not len(gaps):
+            continue
+        rounded = np.round(gaps, DIGITS - 1)
+        _, which, counts = np.unique(rounded, return_inverse=True, return_counts=True)
+        step = float(np.mean(gaps[which == np.argmax(counts)]))  # the commonest
+        turns = values / step  # starts are means, and stand between steps
+        off = turns - np.angle(np.mean(np.exp(2j * np.pi * turns))) / (2 * np.pi)
+        if np.mean(np.abs(off - np.round(off)) < ON_GRID) > MOSTLY:
+            steps[channel] = step
+    return steps
 
 
 def _spread(parts: Sequence[Array]) -> tuple[float, float]:

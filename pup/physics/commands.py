@@ -57,9 +57,11 @@ class HeldCommands(ABC):
         """
         end = (step + 0.5) * self.timestep - lateness
         now, told = self._held_at(end)
-        before, _ = self._held_at((step - 0.5) * self.timestep - lateness)
         since = (end - told) / self.timestep
-        share = np.where(now == before, 1.0, np.clip(since, 0, 1))
+        if (since >= 1).all():  # what is held now has been held since the sub-step's beginning
+            return Target(now, None, _ONE)
+        before, _ = self._held_at((step - 0.5) * self.timestep - lateness)
+        share = np.where(now == before, 1.0, np.minimum(np.maximum(since, 0), 1))
         return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
 
     @abstractmethod
@@ -94,31 +96,36 @@ class Commands(HeldCommands):
         rows = np.stack(
             [np.maximum(np.searchsorted(row, ends, "right") - 1, 0) for row in self.time], axis=1
         )
-        self._row = rows[1:]
+        # Taken from flat arrays: twice as fast as by several indices, and done at each sub-step.
+        ticks, joints = self.held.shape[1:]
+        first = np.arange(len(plans)) * ticks
+        self._flat = self.held.reshape(-1, joints)
+        self._at, self._from = first + rows[1:], first + rows[:-1]
+        self._first = first[:, None, None]
+        self._cell = (np.arange(len(plans)) * self._last.shape[1])[:, None, None]
+        self._joints = np.arange(joints)
         since = (ends[1:, None] - np.take_along_axis(self.time.T, rows[1:], axis=0)) / timestep
         recordings = np.arange(len(plans))
         changed = self.held[recordings, rows[1:]] != self.held[recordings, rows[:-1]]
-        self._before = rows[:-1]
         self._share = np.where(changed.any(axis=2), np.clip(since, 0, 1), 1.0)
         self._changes = (self._share < 1).cumsum(axis=1)
 
     def on_time(self, step: int | Array, running: int) -> Target:
         """See HeldCommands; all recordings are at the same sub-step."""
-        recordings = np.arange(running)
-        now = self.held[recordings, self._row[step, :running], None]
+        now = self._flat.take(self._at[step, :running], axis=0)[:, None]
         if not self._changes[step, running - 1]:
             return Target(now, None, _ONE)
-        before = self.held[recordings, self._before[step, :running], None]
+        before = self._flat.take(self._from[step, :running], axis=0)[:, None]
         share = np.where(now == before, 1.0, self._share[step, :running, None, None])
         return Target(now, before, share)
 
     def _held_at(self, time: Array) -> tuple[Array, Array]:
-        recordings = np.arange(len(time))[:, None, None]
-        cell = np.clip((time / self.timestep).astype(np.int64), 0, self.steps)
-        row = self._last[recordings, cell]
-        row = row + (self.time[recordings, row + 1] <= time)
-        joints = np.arange(self.held.shape[2])
-        return self.held[recordings, row, joints], self.time[recordings, row]
+        n = len(time)
+        cell = np.minimum(np.maximum((time / self.timestep).astype(np.int64), 0), self.steps)
+        row = self._first[:n] + self._last.take(self._cell[:n] + cell)
+        row += self.time.take(row + 1) <= time
+        held = self.held.take(row * len(self._joints) + self._joints)
+        return held, self.time.take(row)
 
 
 class LiveCommands(HeldCommands):

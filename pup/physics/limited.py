@@ -30,6 +30,7 @@ class LimitedLaw:
         self.viscous = viscous
         self.timestep = np.broadcast_to(timestep, (len(inertia), 1)).copy()
         self._last: tuple[Array, Array, Array] | None = None
+        self._starting = False
         self.derive()
 
     def derive(self) -> None:
@@ -78,6 +79,7 @@ class LimitedLaw:
     def keep(self, velocity: Array, torque: Array, damping: Array) -> None:
         """Note what a sub-step applies, for the next one."""
         self._last = velocity.copy(), torque, damping
+        self._starting = False
 
     def begin(self) -> None:
         """Let all simulations start: nothing is known of what has acted before."""
@@ -109,6 +111,7 @@ class LimitedLaw:
             self._last = still, still.copy(), still.copy()
         before, acted, damping = self._last
         before[rows], acted[rows], damping[rows] = velocity, torque, 0.0
+        self._starting = True
 
     def state(self) -> dict[str, Array]:
         """What the next sub-step depends on: velocity, torque and damping of the last one."""
@@ -119,6 +122,7 @@ class LimitedLaw:
         """Take up a state."""
         before, torque, damping = (state[name].copy() for name in _KEPT)
         self._last = before, torque, damping
+        self._starting = True
 
     def acted(self, velocity: Array) -> Array:
         """The servos' torques over the last sub-step, N m, which ended at a velocity."""
@@ -160,7 +164,8 @@ class LimitedLaw:
         slower = reach * damping
         slower += 1
         ahead /= slower
-        begin(ahead, velocity)
+        if self._starting:
+            begin(ahead, velocity)
         return ahead
 
     def implicit(self, damping: Array) -> Array | None:

@@ -13,6 +13,8 @@ FIRMEST = 2.0
 """Squared phase of a joint that swings on its bristle, in a sub-step, from which it is softened."""
 HARDLY = 1e-4
 """Slip, as a share of a bristle's length, that bends it in proportion."""
+LEAST = 1e-30
+"""Slip that is none."""
 
 
 class Friction(Term):
@@ -67,8 +69,9 @@ class Friction(Term):
 
 def _half(slip: Array) -> tuple[Array, Array]:
     """What a bend keeps of itself over a half sub-step's slip, in the mean and at its end."""
+    slip = np.maximum(slip, LEAST)
     lost = np.expm1(-slip)
-    return np.where(slip > HARDLY, -lost / np.maximum(slip, HARDLY), 1 - slip / 2), 1 + lost
+    return -lost / slip, 1 + lost
 
 
 class CoulombFriction(Friction):
