@@ -13,8 +13,9 @@ from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import GAIN, SMALL, improves, matters
-from pup.diagnosis.nominal import Nominal, fit_nominal
+from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
+from pup.diagnosis.poor import why_poor
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise, assumed_noise, quiet_noise
@@ -30,10 +31,6 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-FEWEST = 60
-"""Samples below which nothing can be said."""
-MOTION = 0.02
-"""A joint that never moves by as much shows nothing, rad."""
 SAME_SIGMA, SAME_RHO = 0.1, 0.15
 """Noise told anew that differs by less, as a share and in its memory, is what was assumed."""
 ASTRAY = 1.7
@@ -116,7 +113,8 @@ def diagnose(
     measured = Measured.of(robot, pieces(recordings))
     replays = Replays(measured, robot_space(robot, "pd"), runner(measured), lanes)
     progress("nominal fit", 0.0)
-    nominal = fit_nominal(replays, assumed_noise(measured), rng)
+    poor, noise = why_poor(measured), assumed_noise(measured)
+    nominal = unfitted(replays, noise) if poor else fit_nominal(replays, noise, rng)
     seen = _regimes(nominal, replays)
 
     def told(verdict: Answer, reason: str = "", **more: Any) -> Diagnosis:
@@ -139,9 +137,8 @@ def diagnose(
             **(known | more),
         )
 
-    reason = _too_poor(measured)
-    if reason:
-        return told("undetermined", reason)
+    if poor:
+        return told("undetermined", poor)
     first = _first_look(nominal, replays, rng, progress)
     if first is not None:
         nominal = replace(nominal, certificate=first[0].certificate)
@@ -282,22 +279,6 @@ def _regimes(nominal: Nominal, replays: Replays) -> list[Regime]:
     values = space.at(nominal.fit.values).candidates()
     limits, gains = (per_joint(measured.robot, values, kind)[0] for kind in ("tau_max", "kp"))
     return regimes(measured, np.where(np.isnan(simulated), 0.0, simulated), limits, gains)
-
-
-def _too_poor(measured: Measured) -> str:
-    """Why the data can show nothing; empty where they may."""
-    if len(measured.values) < FEWEST:
-        return f"{len(measured.values)} readings are too few to tell anything"
-    reach = [
-        float(np.ptp(measured.values[measured.channel == j]))
-        for j in range(len(measured.robot.joints))
-        if (measured.channel == j).any()
-    ]
-    if max(reach, default=0.0) < MOTION:
-        return f"no joint moves by more than {MOTION:g} rad"
-    if len(measured.recordings) < 2:
-        return "one recording leaves nothing to check a finding on; record a second motion"
-    return ""
 
 
 def _unsettled(nominal: Nominal) -> str:

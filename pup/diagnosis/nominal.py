@@ -152,6 +152,20 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     return Nominal(best, noise, Certificate(starts, agreed, recovered, left, samples))
 
 
+def unfitted(replays: Replays, noise: Noise) -> Nominal:
+    """The nominal model as the robot describes it, for recordings that nothing can be fitted to."""
+    space = replays.space
+    ground = any(r.support == "ground" for r in replays.measured.recordings)
+    names = free_names(space, ground)
+    fit = _start(
+        [nominal_coordinate(space, n) for n in names], space, 0.0, np.random.default_rng(0)
+    )
+    fit_together([fit], replays, noise, iterations=0)
+    return Nominal(
+        fit, noise, Certificate((fit.chi2,), False, 0.0, 0.0, len(replays.measured.values))
+    )
+
+
 def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
     """Fits to begin with on the ground: brought near in the air, then on the floor that suits each.
 

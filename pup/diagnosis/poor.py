@@ -1,0 +1,144 @@
+"""Recordings that cannot show anything, or not what they seem to: said before any fit is believed.
+
+A simulator fits a dead encoder, a clipped one or two exchanged columns with whatever physics it
+has, and well enough to sound sure. Each of these leaves a mark in the readings themselves.
+"""
+
+from collections.abc import Iterator
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.residuals import Measured
+from pup.physics.terms.scale import Scale
+
+Array = NDArray[np.float64]
+
+FEWEST = 60
+"""Samples below which nothing can be said."""
+MOTION = 0.02
+"""A joint that never moves by as much shows nothing, rad; slides as much less as their range is."""
+SLOWEST = 0.12
+"""Readings further apart tell nothing of a servo, which answers within a tenth of a second, s."""
+ASKED, DEAD = 0.1, 0.05
+"""A joint that is asked to move by as much, rad, and moves by less than this share of it, is dead
+or blocked."""
+CLIPPED, USUAL, WIDE = 8, 0.34, 0.2
+"""So many equal readings in a row at an end of the range are a clipped encoder's, where no others
+are as long as this share of them, and commands meanwhile range as widely, rad."""
+FEW = 10
+"""Values that a recording must have to have ends."""
+EXCHANGED = 0.5
+"""A joint's readings follow another's commands where they are off by less than this share of what
+they are off from its own."""
+
+
+def why_poor(measured: Measured) -> str:
+    """Why some recordings can show nothing; empty where they may."""
+    return next(_reasons(measured), "")
+
+
+def _reasons(measured: Measured) -> Iterator[str]:
+    if len(measured.values) < FEWEST:
+        yield f"{len(measured.values)} readings are too few to tell anything"
+        return
+    joints = range(len(measured.robot.joints))
+    angle = Scale.of(measured.robot).angle
+    every = range(len(measured.recordings))
+    moves = [
+        max(
+            _reach(measured.values[(measured.channel == j) & (measured.recording == i)])
+            for i in every
+        )
+        for j in joints
+    ]
+    if max(moves) < MOTION * angle:
+        yield f"no joint moves by more than {MOTION:g} rad"
+    if len(measured.recordings) < 2:
+        yield "one recording leaves nothing to check a finding on; record a second motion"
+    step = np.diff(measured.time)
+    apart = float(np.median(step[step > 0]))
+    if apart > SLOWEST:
+        yield (
+            f"readings are {apart:.2g} s apart, and servos answer within 0.1 s; record at 20 Hz or "
+            "faster"
+        )
+    targets = _targets(measured)
+    asked = np.concatenate(targets)
+    for j, name in enumerate(measured.robot.joint_names):
+        wanted = max(_reach(target[:, j]) for target in targets)
+        if wanted >= ASKED * angle and moves[j] < DEAD * wanted:
+            yield (
+                f"{name} hardly moves though it is asked to: its encoder is dead or the joint is "
+                "blocked; look at it, or leave these recordings out"
+            )
+        if _clipped(measured, j):
+            yield (
+                f"readings of {name} stop short at an end of their range, again and again at the "
+                "same value: they are clipped; record with the encoder's whole range"
+            )
+    exchanged = _exchanged(measured, asked)
+    if exchanged:
+        yield (
+            f"readings of {exchanged[0]} follow the commands of {exchanged[1]}: columns or servo "
+            "ids are exchanged"
+        )
+
+
+def _reach(values: Array) -> float:
+    return float(np.ptp(values)) if len(values) else 0.0
+
+
+def _targets(measured: Measured) -> list[Array]:
+    """Commands of each recording in the robot's order, shape (n_ticks, n_joints), rad."""
+    names = measured.robot.joint_names
+    return [r.target[:, [r.joints.index(n) for n in names]] for r in measured.recordings]
+
+
+def _clipped(measured: Measured, joint: int) -> bool:
+    """Whether readings stand still at an end of their range alone, whatever is commanded."""
+    name, ends, others, asked = measured.robot.joint_names[joint], 0, 0, 0.0
+    for number, recording in enumerate(measured.recordings):
+        own = (measured.channel == joint) & (measured.recording == number)
+        values = measured.values[own]
+        if len(np.unique(values)) < FEW:
+            continue
+        tick = np.searchsorted(recording.time - recording.time[0], measured.time[own] - 1e-9)
+        target = recording.target[tick, recording.joints.index(name)]
+        edges = np.flatnonzero(np.r_[True, np.diff(values) != 0, True])
+        lengths = np.diff(edges)
+        for end in (values.min(), values.max()):
+            long = [
+                slice(start, start + length)
+                for start, length in zip(edges, lengths, strict=False)
+                if values[start] == end and length >= CLIPPED
+            ]
+            if long:
+                ends = max(ends, *(run.stop - run.start for run in long))
+                asked = max(asked, _reach(np.concatenate([target[run] for run in long])))
+        inside = (values[edges[:-1]] > values.min()) & (values[edges[:-1]] < values.max())
+        others = max(others, int(lengths[inside].max()))
+    return asked > WIDE and others < USUAL * ends
+
+
+def _exchanged(measured: Measured, asked: Array) -> tuple[str, str] | None:
+    """A joint whose readings follow another's commands, and that other."""
+    read = np.concatenate(
+        [
+            r.position[:, [r.joints.index(name) for name in measured.robot.joint_names]]
+            for r in measured.recordings
+        ]
+    )
+    names = measured.robot.joint_names
+
+    def off(joint: int, other: int) -> float:
+        error = read[:, joint] - asked[:, other]
+        return float(np.nanstd(error))
+
+    for joint, other in permutations(range(len(names)), 2):
+        if _reach(asked[:, other]) < ASKED or np.isnan(read[:, joint]).all():
+            continue
+        if off(joint, other) < EXCHANGED * off(joint, joint):
+            return names[joint], names[other]
+    return None

@@ -1,0 +1,87 @@
+"""Recordings with a fault of their own are known by it, and sound ones are not suspected."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pup.diagnosis.poor import why_poor
+from pup.diagnosis.residuals import Measured
+from pup.recording import Recording
+from pup.recording_cuts import thinned
+from pup.robot import RobotDescription
+
+LEG = RobotDescription.load("darwin_leg")
+LSB = 2 * np.pi / 4096
+KNEE, PITCH = (LEG.joint_names.index(name) for name in ("l_knee", "l_ank_pitch"))
+
+
+def leg(seed: int = 0, noise: float = 0.001) -> list[Recording]:
+    """Three motions of a leg whose joints follow their commands within 60 ms, read to 12 bits."""
+    rng = np.random.default_rng(seed)
+    runs = []
+    for motion in ("step", "multisine", "hold"):
+        time = np.arange(0, 6, 0.03)
+        levels = rng.uniform(-0.4, 0.4, (12, len(LEG.joints)))
+        target = levels[(time / 0.5).astype(int)]
+        if motion == "multisine":
+            tone = rng.uniform(0.5, 2.0, len(LEG.joints))
+            target = 0.4 * np.sin(np.outer(time, 2 * np.pi * tone))
+        position = np.zeros_like(target)
+        for i in range(1, len(time)):
+            position[i] = position[i - 1] + 0.4 * (target[i - 1] - position[i - 1])
+        read = np.round((position + noise * rng.normal(size=position.shape)) / LSB) * LSB
+        names = LEG.joint_names
+        runs.append(
+            Recording(motion, LEG.name, motion, "suspended", "hardware", names, time, target, read)
+        )
+    return runs
+
+
+def exchanged(runs: Sequence[Recording]) -> list[Recording]:
+    order = list(range(len(LEG.joints)))
+    order[KNEE], order[PITCH] = PITCH, KNEE
+    return [replace(r, position=r.position[:, order]) for r in runs]
+
+
+def changed(
+    runs: Sequence[Recording], joint: int, change: Callable[[np.ndarray], np.ndarray]
+) -> list[Recording]:
+    out = []
+    for run in runs:
+        position = run.position.copy()
+        position[:, joint] = change(position[:, joint])
+        out.append(replace(run, position=position))
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sound_recordings_are_not_suspected(seed: int) -> None:
+    assert why_poor(Measured.of(LEG, leg(seed))) == ""
+
+
+def test_a_noiseless_encoder_at_rest_is_not_clipped() -> None:
+    """Steps end where they end, again and again at one reading; so they do in the middle."""
+    assert why_poor(Measured.of(LEG, leg(noise=0.0))) == ""
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda runs: runs[:1], "second motion"),
+        (lambda runs: [thinned(r, 7) for r in runs], "0.21 s apart"),
+        (lambda runs: changed(runs, KNEE, lambda q: 0 * q + q[0]), "l_knee hardly moves"),
+        (lambda runs: changed(runs, PITCH, lambda q: q.clip(-0.15, 0.15)), "l_ank_pitch stop"),
+        (exchanged, "l_knee follow the commands of l_ank_pitch"),
+        (lambda runs: [replace(r, target=0 * r.target + i, position=0 * r.position + i)
+                       for i, r in enumerate(runs)],
+         "no joint moves"),
+        (lambda runs: [replace(r, time=r.time[:3], target=r.target[:3], position=r.position[:3])
+                       for r in runs], "too few"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_recordings_is_said(
+    spoil: Callable[[Sequence[Recording]], Sequence[Recording]], why: str
+) -> None:
+    assert why in why_poor(Measured.of(LEG, spoil(leg())))
