@@ -155,7 +155,7 @@ def diagnose(
     final = selector.predicting(left.model if left else model)
     shown = held_out(measured, selector.nominal, final, seed)
     little = ""
-    if not _matters(model, left, shown, nominal.noise):
+    if not _matters(selector.nominal, model, left, shown, nominal.noise):
         little = _little(model, shown)
         left, model = None, selector.nominal
         final = model
@@ -215,17 +215,17 @@ def _weighed(
     return nominal, search(replays, nominal, rng, progress, first[1] if first else None)
 
 
-def _matters(model: Model, left: Unexplained | None, shown: HeldOut, noise: Noise) -> bool:
+def _matters(
+    nominal: Model, model: Model, left: Unexplained | None, shown: HeldOut, noise: Noise
+) -> bool:
     """Whether what was found is material, or something unknown: that is large, or predicted."""
-    if model.hypotheses and matters(model, shown, noise):
+    if model.hypotheses and matters(nominal, model, shown, noise):
         return True
     if left is None:
         return False
     if max(lack.excess for lack in left.lacks) > ALONE:
         return True
-    if model.hypotheses:
-        return improves(shown, noise, model.measured.robot)
-    return shown.interval[0] > 0
+    return improves(model, shown, noise) if model.hypotheses else shown.interval[0] > 0
 
 
 def _little(model: Model, shown: HeldOut) -> str:
@@ -233,11 +233,11 @@ def _little(model: Model, shown: HeldOut) -> str:
     if not model.hypotheses:
         return ""
     found = ", ".join(f"{h.effect} at {h.place}" for h in model.hypotheses)
-    why = "predicts motions left out no better"
+    why = "hardly changes what is predicted of motions left out"
     if shown.after < shown.before:
         why = (
-            f"is below {SMALL:g} of its typical size and lowers no joint's error on motions left "
-            f"out by {GAIN:g} of its noise"
+            f"is below {SMALL:g} of its typical size, or hardly shows, and lowers no joint's error "
+            f"on motions left out by {GAIN:g} of its noise"
         )
     return f"found, but not material: {found}, which {why}"
 

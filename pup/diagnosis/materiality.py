@@ -1,42 +1,67 @@
 """Whether what was found matters: `none` means that nothing material is missing.
 
 Every robot has a little of everything. What is there by its traces, but small as such things go
-and of no use in predicting motions, is left out of a simulator for good reason.
+and of no use in predicting motions, is left out of a simulator for good reason. So is what hardly
+shows: an encoder's offset of any size, where the motions would be the same without.
 """
+
+from collections.abc import Iterator
+
+import numpy as np
 
 from pup.diagnosis.residuals import Noise
 from pup.diagnosis.selection import Model
 from pup.diagnosis.verdict import HeldOut
-from pup.robot import RobotDescription
 
 SMALL = 0.1
 """Share of its typical size below which an effect is small."""
 GAIN = 0.3
-"""Share of a joint's noise by which its error on motions left out falls where that matters."""
+"""Share of a joint's noise by which its error falls where that matters whatever the size is."""
+TRACE = 0.02
+"""The same of motions left out, below which an effect of any size does not show."""
 
 
-def matters(model: Model, shown: HeldOut, noise: Noise) -> bool:
+def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
     """Whether a model with effects is worth having instead of the nominal one.
 
     Args:
-      model: the nominal model with what was found.
+      nominal: the nominal model.
+      model: the same with what was found.
       shown: errors of both on motions left out.
       noise: of the joints' readings.
     """
-    if shown.after >= shown.before:
-        return False
-    return largest(model) >= SMALL or improves(shown, noise, model.measured.robot)
+    if improves(model, shown, noise) or _explains(nominal, model):
+        return True
+    predicts = shown.after < shown.before and max(_gains(model, shown, noise)) > TRACE
+    return predicts and _largest(model) >= SMALL
 
 
-def largest(model: Model) -> float:
+def improves(model: Model, shown: HeldOut, noise: Noise) -> bool:
+    """Whether some joint's motions that were left out are predicted better by much."""
+    return max(_gains(model, shown, noise)) > GAIN
+
+
+def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
+    """By how much the joints' errors on motions left out fall, in their noise."""
+    names = model.measured.robot.joint_names
+    for name, (before, after) in shown.per_joint.items():
+        yield (before - after) / float(noise.sigma[names.index(name)])
+
+
+def _explains(nominal: Model, model: Model) -> bool:
+    """Whether some joint's error falls by much on what was fitted."""
+    assert nominal.fit.residual is not None and model.fit.residual is not None
+    channel = model.measured.channel
+    readings = np.maximum(np.bincount(channel), 1)
+    before, after = (
+        np.sqrt(np.bincount(channel, fit.residual**2) / readings)
+        for fit in (nominal.fit, model.fit)
+        if fit.residual is not None
+    )
+    return bool((before - after > GAIN).any())
+
+
+def _largest(model: Model) -> float:
     """Size of the effect that is largest, next to what is typical of its kind."""
     at = dict(zip(model.fit.names, model.fit.at, strict=True))
     return max((abs(at[n]) for h in model.hypotheses for n in h.magnitudes), default=0.0)
-
-
-def improves(shown: HeldOut, noise: Noise, robot: RobotDescription) -> bool:
-    """Whether some joint's motions are predicted better by a share of its noise."""
-    return any(
-        before - after > GAIN * noise.sigma[robot.joint_names.index(name)]
-        for name, (before, after) in shown.per_joint.items()
-    )
