@@ -28,6 +28,8 @@ STARTS, LANDED = 3, 2
 HORIZONS = (1.0, 2.5)
 """Seconds of each recording that a first fit is made to, then a second one: with all of it at once,
 a start whose motion gets out of step settles anywhere."""
+LONG = 40
+"""Steps that these first fits may take, which cost little."""
 FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
 """Frictions that a fit may start from on the ground."""
 SPREAD = 0.35
@@ -208,7 +210,7 @@ def _moved(fits: Sequence[Fit], replays: Replays, noise: Noise, part: NDArray[np
         )
         for fit in fits
     ]
-    fit_together(others, replays, noise)
+    fit_together(others, replays, noise, LONG)
     for fit, found in zip(fits, others, strict=True):
         fit.at = found.at
 
