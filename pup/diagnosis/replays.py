@@ -24,7 +24,7 @@ Row = Mapping[str, float]
 
 BATCH = 384
 """Simulations in a batch, at most."""
-WORTH = 30
+WORTH = 8
 """Simulations that are worth a batch of their own."""
 
 
