@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.recording import Recording
@@ -33,13 +34,11 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
             f"recording {recording.id!r}: {start:g} to {stop:g} s holds {kept.sum()} rows; "
             f"it lasts {since[-1]:g} s"
         )
+    part = _rows(recording, kept)
     return replace(
-        recording,
+        part,
         id=id or f"{recording.id}_{start:g}s",
-        time=recording.time[kept] - recording.time[kept][0],
-        target=recording.target[kept],
-        position=recording.position[kept],
-        extras={name: values[kept] for name, values in recording.extras.items()},
+        time=part.time - part.time[0],
         repeat_of=None,
         notes=f"{recording.notes} From {start:g} to {stop:g} s.".strip(),
     )
@@ -47,13 +46,18 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
 
 def beginning(recording: Recording, until: float) -> Recording:
     """The recording up to some time after its start, s; two rows of it at least."""
-    kept = max(FEWEST, int(np.sum(recording.time - recording.time[0] < until)))
+    last = max(FEWEST, int(np.sum(recording.time - recording.time[0] < until)))
+    return _rows(recording, np.arange(len(recording.time)) < last)
+
+
+def _rows(recording: Recording, kept: NDArray[np.bool_]) -> Recording:
+    """Some rows of a recording, all else as it is."""
     return replace(
         recording,
-        time=recording.time[:kept],
-        target=recording.target[:kept],
-        position=recording.position[:kept],
-        extras={name: values[:kept] for name, values in recording.extras.items()},
+        time=recording.time[kept],
+        target=recording.target[kept],
+        position=recording.position[kept],
+        extras={name: values[kept] for name, values in recording.extras.items()},
     )
 
 

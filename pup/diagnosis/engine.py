@@ -12,7 +12,7 @@ from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
-from pup.diagnosis.materiality import GAIN, SMALL, improves, matters
+from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.poor import why_poor
@@ -154,9 +154,9 @@ def diagnose(
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
     shown = held_out(measured, selector.nominal, final, seed)
-    little = ""
+    slight = ""
     if not _matters(selector.nominal, model, left, shown, nominal.noise):
-        little = _little(model, shown)
+        slight = little(model, shown)
         left, model = None, selector.nominal
         final = model
         shown = held_out(measured, model, model, seed)
@@ -170,7 +170,7 @@ def diagnose(
         "unexplained": left,
     }
     if not model.hypotheses and not left:
-        return told("none", little, **evidence)
+        return told("none", slight, **evidence)
     progress("where", 0.87)
     differentiate([final.fit], replays, nominal.noise)
     evidence["missing"] = missing_input(nominal.fit, replays, nominal.noise)
@@ -226,20 +226,6 @@ def _matters(
     if max(lack.excess for lack in left.lacks) > ALONE:
         return True
     return improves(model, shown, noise) if model.hypotheses else shown.interval[0] > 0
-
-
-def _little(model: Model, shown: HeldOut) -> str:
-    """What was found and does not matter, in words; empty where nothing was."""
-    if not model.hypotheses:
-        return ""
-    found = ", ".join(f"{h.effect} at {h.place}" for h in model.hypotheses)
-    why = "hardly changes what is predicted of motions left out"
-    if shown.after < shown.before:
-        why = (
-            f"is below {SMALL:g} of its typical size, or hardly shows, and lowers no joint's error "
-            f"on motions left out by {GAIN:g} of its noise"
-        )
-    return f"found, but not material: {found}, which {why}"
 
 
 def _first_look(

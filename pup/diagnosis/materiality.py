@@ -8,10 +8,13 @@ shows: an encoder's offset of any size, where the motions would be the same with
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pup.diagnosis.residuals import Noise
 from pup.diagnosis.selection import Model
 from pup.diagnosis.verdict import HeldOut
+
+Array = NDArray[np.float64]
 
 SMALL = 0.1
 """Share of its typical size below which an effect is small."""
@@ -41,6 +44,20 @@ def improves(model: Model, shown: HeldOut, noise: Noise) -> bool:
     return max(_gains(model, shown, noise)) > GAIN
 
 
+def little(model: Model, shown: HeldOut) -> str:
+    """What was found and does not matter, in words; empty where nothing was."""
+    if not model.hypotheses:
+        return ""
+    found = ", ".join(f"{h.effect} at {h.place}" for h in model.hypotheses)
+    why = "hardly changes what is predicted of motions left out"
+    if shown.after < shown.before:
+        why = (
+            f"is below {SMALL:g} of its typical size, or hardly shows, and lowers no joint's error "
+            f"on motions left out by {GAIN:g} of its noise"
+        )
+    return f"found, but not material: {found}, which {why}"
+
+
 def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
     """By how much the joints' errors on motions left out fall, in their noise."""
     names = model.measured.robot.joint_names
@@ -50,15 +67,14 @@ def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
 
 def _explains(nominal: Model, model: Model) -> bool:
     """Whether some joint's error falls by much on what was fitted."""
-    assert nominal.fit.residual is not None and model.fit.residual is not None
     channel = model.measured.channel
     readings = np.maximum(np.bincount(channel), 1)
-    before, after = (
-        np.sqrt(np.bincount(channel, fit.residual**2) / readings)
-        for fit in (nominal.fit, model.fit)
-        if fit.residual is not None
-    )
-    return bool((before - after > GAIN).any())
+
+    def error(one: Model) -> Array:
+        assert one.fit.residual is not None
+        return np.asarray(np.sqrt(np.bincount(channel, one.fit.residual**2) / readings))
+
+    return bool((error(nominal) - error(model) > GAIN).any())
 
 
 def _largest(model: Model) -> float:

@@ -4,7 +4,7 @@ A simulator fits a dead encoder, a clipped one or two exchanged columns with wha
 has, and well enough to sound sure. Each of these leaves a mark in the readings themselves.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import permutations
 
 import numpy as np
@@ -64,7 +64,7 @@ def _reasons(measured: Measured) -> Iterator[str]:
             f"readings are {apart:.2g} s apart, and servos answer within 0.1 s; record at 20 Hz or "
             "faster"
         )
-    targets = _targets(measured)
+    targets = _ordered(measured, [r.target for r in measured.recordings])
     asked = np.concatenate(targets)
     for j, name in enumerate(measured.robot.joint_names):
         wanted = max(_reach(target[:, j]) for target in targets)
@@ -90,10 +90,13 @@ def _reach(values: Array) -> float:
     return float(np.ptp(values)) if len(values) else 0.0
 
 
-def _targets(measured: Measured) -> list[Array]:
-    """Commands of each recording in the robot's order, shape (n_ticks, n_joints), rad."""
+def _ordered(measured: Measured, values: Sequence[Array]) -> list[Array]:
+    """Columns of each recording in the robot's order, shape (n_ticks, n_joints), rad."""
     names = measured.robot.joint_names
-    return [r.target[:, [r.joints.index(n) for n in names]] for r in measured.recordings]
+    return [
+        v[:, [r.joints.index(n) for n in names]]
+        for v, r in zip(values, measured.recordings, strict=True)
+    ]
 
 
 def _clipped(measured: Measured, joint: int) -> bool:
@@ -124,17 +127,11 @@ def _clipped(measured: Measured, joint: int) -> bool:
 
 def _exchanged(measured: Measured, asked: Array) -> tuple[str, str] | None:
     """A joint whose readings follow another's commands, and that other."""
-    read = np.concatenate(
-        [
-            r.position[:, [r.joints.index(name) for name in measured.robot.joint_names]]
-            for r in measured.recordings
-        ]
-    )
+    read = np.concatenate(_ordered(measured, [r.position for r in measured.recordings]))
     names = measured.robot.joint_names
 
     def off(joint: int, other: int) -> float:
-        error = read[:, joint] - asked[:, other]
-        return float(np.nanstd(error))
+        return float(np.nanstd(read[:, joint] - asked[:, other]))
 
     for joint, other in permutations(range(len(names)), 2):
         if _reach(asked[:, other]) < ASKED or np.isnan(read[:, joint]).all():
