@@ -1,10 +1,10 @@
 """Post-sysID on concealed virtual robots, against a dense grid over eta on the same robots.
 
 Each robot is walked through the real chain: gateway, agent, Dynamixel packets on a pseudo-terminal;
-in lock-step. The grid is walked through it too: twice everywhere, and where that is best five times
-more, by which its best is both chosen and told. What a study found is told by five walks of what it
-chose. `--simulated` gives rollouts of `pup replay --landscape`: a second, shorter study begins with
-them.
+in lock-step. What a study found is told by five walks of what it chose. The grid is walked by the
+same robot without its bus (`hardware_agent.virtual.walks`), whose readings are the same to the last
+bit; how far both agree is told from the walks of the study, each walked there too.
+`--simulated` gives rollouts of `pup replay --landscape`: a second, shorter study begins with them.
 
     python -m benchmarks.post_sysid forward/policy --simulated walk/simulated.json --out results
 
@@ -14,24 +14,33 @@ Robots that are done are kept in `--out`; the same command goes on.
 import argparse
 import itertools
 import json
+import multiprocessing
 import statistics
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hardware_agent.virtual.fleet import Fleet
+from hardware_agent.virtual.walks import walk
 from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
-from services.laboratory import Laboratory
+from services.laboratory import RATE, Laboratory
 from services.transfer import read_simulated
 from services.trials import Budget, fitted_eta, follow
 
-AT_ONCE = 16
-"""Etas that a study compares at most."""
+Array = NDArray[np.float64]
+
+ABREAST = 64
+"""Robots that walk at once on the grid."""
+BEST, DRAWS = 8, 5
+"""Points of the grid that are walked again, and how often; the best of them is the grid's."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,7 @@ class Plan:
     """What is walked on each robot.
 
     Attributes:
-      robot: the robot.
+      robot: its name.
       policy: its bundle.
       side: points of the grid along each entry of eta.
       simulated: rollouts for the second study; None leaves it out.
@@ -47,79 +56,86 @@ class Plan:
       out: folder of the results.
     """
 
-    robot: RobotDescription
+    robot: str
     policy: Path
     side: int
     simulated: dict[str, Any] | None
     trials: int
     out: Path
 
-    def grid(self) -> list[list[float]]:
-        """Etas over the box of the policy."""
-        card = NumpyPolicy.load(self.policy, self.robot).card
-        box = zip(card.eta_lower, card.eta_upper, strict=True)
-        axes = [np.linspace(low, high, self.side) for low, high in box]
-        return [list(map(float, eta)) for eta in itertools.product(*axes)]
+    def file(self, seed: int) -> Path:
+        """Of the results of a robot."""
+        return self.out / f"robot{seed}.json"
 
-    def one(self, seed: int) -> dict[str, Any]:
-        """All studies on the robot of a seed."""
+    def one(self, seed: int) -> None:
+        """All studies and the grid on the robot of a seed, written down."""
+        robot = RobotDescription.load(self.robot)
+        policy = NumpyPolicy.load(self.policy, robot)
+        fitted = fitted_eta(policy, read_bounds(robot.identified_path, robot)).tolist()
         folder = self.out / f"robot{seed}"
-        bounds = read_bounds(self.robot.identified_path, self.robot)
-        fitted = fitted_eta(NumpyPolicy.load(self.policy, self.robot), bounds).tolist()
-        with Laboratory(folder, self.robot, self.policy, seed) as laboratory:
-            walks = _Walks(laboratory, folder, seed)
-            cold = walks.study("cold", trials=25, compare=[fitted])
-            told = {"seed": seed, "cold": _mean(cold, "repeat"), "fitted": _mean(cold, "compare")}
-            told["eta"] = cold["eta"]
+        with Laboratory(folder, robot, self.policy, seed) as laboratory:
+
+            def study(name: str, trials: int, **more: Any) -> dict[str, Any]:
+                place = folder / name
+                budget = Budget(trials, seed=seed)
+                return follow(laboratory, name, budget, out=place, told=lambda _: None, **more)
+
+            cold = study("cold", 25, compare=[fitted])
+            told = {"schema": 1, "policy": sha256(self.policy / CARD), "seed": seed}
+            told |= {"cold": _mean(cold, "repeat"), "fitted": _mean(cold, "compare")}
+            told |= {"eta": cold["eta"]}
             if self.simulated is not None:
-                warm = walks.study("warm", trials=self.trials, simulated=self.simulated)
+                warm = study("warm", self.trials, compare=[], simulated=self.simulated)
                 told["warm"] = _mean(warm, "repeat")
-            told["grid"] = walks.best_of(self.grid())
-        return told
+        grid = Grid(robot, policy, seed, cold["settings"]["horizon"])
+        told |= {"grid": grid.best(self.side), "agreement": grid.agreement(cold["trials"])}
+        write_json(self.file(seed), told)
 
 
-class _Walks:
-    def __init__(self, laboratory: Laboratory, folder: Path, seed: int) -> None:
-        self.laboratory, self.folder, self.seed = laboratory, folder, seed
+@dataclass(frozen=True)
+class Grid:
+    """Walks of one robot without its bus."""
 
-    def study(
-        self,
-        name: str,
-        trials: int,
-        repeats: int = 5,
-        compare: Sequence[Sequence[float]] = (),
-        simulated: dict[str, Any] | None = None,
-    ) -> dict[str, Any]:
-        """A study to its end."""
-        budget, out = Budget(trials, repeats, self.seed), self.folder / name
-        return follow(self.laboratory, name, budget, compare, out, lambda _: None, simulated)
+    robot: RobotDescription
+    policy: NumpyPolicy
+    seed: int
+    horizon: float
 
-    def best_of(self, grid: list[list[float]]) -> float:
-        """Mean distance of the best eta of a grid, told too large rather than too small.
+    def walked(self, eta: Array, draw: int) -> Array:
+        """Distances of some etas, m, shape (n,)."""
+        told = []
+        for part in np.split(eta, range(ABREAST, len(eta), ABREAST)):
+            fleet = Fleet(self.robot, [self.seed] * len(part))
+            told.append(walk(fleet, self.policy, part, self.horizon, 1 / RATE, draw).distance)
+        return np.concatenate(told)
 
-        Two walks of each choose five, and five more walks of each of these choose the best and tell
+    def best(self, side: int) -> float:
+        """Mean distance of the best eta of a grid, m, told too large rather than too small.
+
+        One walk of each chooses some, and five more walks of each of these choose the best and tell
         its mean: that is chosen by the walks that tell it.
         """
-        rough = [
-            self.study(f"grid{i}", trials=1, repeats=2, compare=grid[i : i + AT_ONCE])
-            for i in range(0, len(grid), AT_ONCE)
+        card = self.policy.card
+        axes = [
+            np.linspace(*ends, side) for ends in zip(card.eta_lower, card.eta_upper, strict=True)
         ]
-        means = {
-            tuple(eta): _mean(study, "compare", eta)
-            for study in rough
-            for eta in study["settings"]["compare"]
-        }
-        best = sorted(means, key=lambda eta: -means[eta])[:5]
-        again = self.study("best", trials=1, compare=best)
-        return max(_mean(again, "compare", list(eta)) for eta in best)
+        eta = np.array(list(itertools.product(*axes)))
+        chosen = eta[np.argsort(-self.walked(eta, 0))[:BEST]]
+        again = [self.walked(chosen, draw) for draw in range(1, DRAWS + 1)]
+        return float(np.mean(again, axis=0).max())
+
+    def agreement(self, trials: Sequence[dict[str, Any]]) -> float:
+        """Root mean square difference of a study's walks and the same without a bus, m."""
+        done = [trial for trial in trials if trial["state"] == "succeeded"]
+        here = self.walked(np.array([trial["eta"] for trial in done]), 0)
+        return float(np.sqrt(np.mean((here - [trial["distance"] for trial in done]) ** 2)))
 
 
-def _mean(study: dict[str, Any], purpose: str, eta: list[float] | None = None) -> float:
+def _mean(study: dict[str, Any], purpose: str) -> float:
     told = [
         trial["distance"]
         for trial in study["trials"]
         if (trial["purpose"], trial["state"]) == (purpose, "succeeded")
-        and (eta is None or np.allclose(trial["eta"], eta))
     ]
     return statistics.mean(told) if told else 0.0
 
@@ -130,26 +146,33 @@ def main() -> None:
     parser.add_argument("--robot", default="darwin_op2")
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--first", type=int, default=1000, help="seed of the first robot")
-    parser.add_argument("--side", type=int, default=4, help="points of the grid along each entry")
+    parser.add_argument("--side", type=int, default=7, help="points of the grid along each entry")
     parser.add_argument("--simulated", type=Path)
     parser.add_argument("--trials", type=int, default=10, help="of the study with a prior")
+    parser.add_argument("--at-once", type=int, default=2, help="robots that walk at once")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     simulated = read_simulated(given.simulated) if given.simulated else None
-    robot = RobotDescription.load(given.robot)
-    plan = Plan(robot, given.policy, given.side, simulated, given.trials, given.out)
-    digest = sha256(given.policy / CARD)
-    rows = []
-    for seed in range(given.first, given.first + given.robots):
-        file = given.out / f"robot{seed}.json"
-        if not file.exists():
-            write_json(file, {"schema": 1, "policy": digest} | plan.one(seed))
-        rows.append(read_json(file))
-        print(json.dumps(rows[-1]), flush=True)
+    plan = Plan(given.robot, given.policy, given.side, simulated, given.trials, given.out)
+    seeds = range(given.first, given.first + given.robots)
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(given.at_once, spawn) as pool:
+        rows = []
+        for seed, done in [
+            (s, pool.submit(plan.one, s)) for s in seeds if not plan.file(s).exists()
+        ]:
+            done.result()
+            print(json.dumps(read_json(plan.file(seed))), flush=True)
+        rows = [read_json(plan.file(seed)) for seed in seeds]
     for name in ("cold", "warm", "fitted"):
         shares = [row[name] / row["grid"] for row in rows if row.get(name) is not None]
         if shares:
-            print(f"{name}: {statistics.median(shares):.2f} of the best of the grid, median")
+            told = f"median {statistics.median(shares):.3f}, least {min(shares):.3f}"
+            print(f"{name}: {told} of the best of the grid")
+    both = [row["warm"] / row["cold"] for row in rows if row.get("warm") is not None]
+    if both:
+        print(f"warm of cold: median {statistics.median(both):.3f}, least {min(both):.3f}")
+    print(f"with and without the bus: {max(row['agreement'] for row in rows):.3f} m at most")
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ class Rollout:
         if not low * 0.99 <= rate <= high * 1.01:
             raise InputError(f"the policy was trained for {low:g} to {high:g} Hz, not {rate:g}")
         self._policy, self._eta = policy, np.array(eta, dtype=np.float64)
-        self._columns = _columns(card.joints, card.observation)
+        self._columns = columns(card.joints, card.observation)
         self._offset = card.gait.imu_pitch_offset
         self._start: float | None = None
         self._before: Array | None = None
@@ -102,7 +102,7 @@ class Rollout:
         return np.concatenate([senses.position, [roll, pitch - self._offset]])
 
 
-def _columns(joints: Sequence[str], names: Sequence[str]) -> NDArray[np.intp]:
+def columns(joints: Sequence[str], names: Sequence[str]) -> NDArray[np.intp]:
     """Where a policy's entries stand in two readings in a row."""
     both = [
         *(f"position_before/{joint}" for joint in joints),

@@ -229,12 +229,12 @@ class NumpyPolicy:
         return np.asarray(order @ weights / weights.sum(axis=-2))
 
     def targets(self, time: float, actions: Array) -> Array:
-        """Target positions, rad, shape (n_joints,).
+        """Target positions, rad, shape (..., n_joints).
 
         Args:
           time: since the start of the walk, s.
-          actions: those so far, the newest last, shape (n_actions, n_joints), each between 0 and
-            bins - 1; those before what the smoothing takes are not looked at.
+          actions: those so far, the newest last, shape (n_actions, ..., n_joints), each between 0
+            and bins - 1; those before what the smoothing takes are not looked at.
         """
         card = self.card
         middle = (card.shape.bins - 1) / 2

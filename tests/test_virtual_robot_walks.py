@@ -1,0 +1,53 @@
+"""Walks without a bus are those through it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware_agent.virtual.fleet import Fleet
+from hardware_agent.virtual.walks import walk
+from pup.policy.bundle import NumpyPolicy
+from pup.robot import RobotDescription
+from services.laboratory import RATE, Laboratory
+from services.trials import Budget, follow
+
+DARWIN = RobotDescription.load("darwin_op2")
+POLICY = Path(str(DARWIN.folder)) / "policies" / "forward"
+SEED = 5
+
+
+def test_a_walk_without_packets_is_as_long_as_one_through_the_bus(tmp_path: Path) -> None:
+    policy = NumpyPolicy.load(POLICY, DARWIN)
+    with Laboratory(tmp_path, DARWIN, POLICY, SEED) as laboratory:
+        budget = Budget(3, repeats=0, horizon=6.0)
+        study = follow(laboratory, "walks", budget, [], tmp_path / "walks", lambda _: None)
+    trials = study["trials"]
+    assert [trial["state"] for trial in trials] == ["succeeded"] * 3
+    eta = np.array([trial["eta"] for trial in trials])
+    told = walk(Fleet(DARWIN, [SEED] * 3), policy, eta, 6.0, 1 / RATE)
+    assert told.distance == pytest.approx([trial["distance"] for trial in trials], abs=0.05)
+    assert (told.time == 6.0).all()
+    assert told.distance.min() > 0.3
+
+
+def test_who_falls_has_come_as_far_as_until_then() -> None:
+    policy = NumpyPolicy.load(POLICY, DARWIN)
+    fleet = Fleet(DARWIN, [SEED, SEED])
+    same = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    told = walk(fleet, policy, same, 2.0, 1 / RATE)
+    assert told.distance[0] == told.distance[1]  # the same robot, the same noise
+    lame = walk(Fleet(DARWIN, [SEED]), _lame(policy), same[:1], 6.0, 1 / RATE)
+    assert 0.0 < lame.time[0] < 6.0
+    assert lame.distance[0] < told.distance[0]
+
+
+def _lame(policy: NumpyPolicy) -> NumpyPolicy:
+    """A policy whose left knee is bent as far as it may."""
+    weight, bias = policy.actor[-1]
+    bins = policy.card.shape.bins
+    bias = bias.copy().reshape(bins, -1)
+    bias[-1, policy.card.joints.index("l_knee")] += 1000.0
+    bias[-1, policy.card.joints.index("l_hip_pitch")] += 1000.0
+    policy.actor[-1] = (weight, bias.reshape(-1))
+    return policy
