@@ -36,8 +36,6 @@ PATIENCE = 120.0
 """For a process to be ready, s; the machine may be busy."""
 GRACE = 15.0
 """For a process to end by itself, s."""
-RESTARTS = 3
-"""Of each process, before the laboratory is given up."""
 
 CONFIG = """schema = 1
 name = {agent}
@@ -99,6 +97,9 @@ class Laboratory(AbstractContextManager["Laboratory"]):
       url: of the gateway.
       token: of an operator.
     """
+
+    restarts = 3
+    """Of each process, before the laboratory is given up."""
 
     def __init__(self, folder: Path, robot: RobotDescription, policy: Path, seed: int) -> None:
         self.folder, self.robot, self.seed = folder.absolute(), robot, seed
@@ -200,7 +201,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
 
     def _start(self, name: str) -> None:
         self._starts[name] = self._starts.get(name, 0) + 1
-        if self._starts[name] > 1 + RESTARTS:
+        if self._starts[name] > 1 + self.restarts:
             raise ChildProcessError(f"the {name} ends again and again: {self._last_words(name)}")
         command, told = self._commands[name]
         # Settings of a gateway or an agent that the user has besides are not for these.

@@ -102,12 +102,6 @@ def _seen(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | N
     return Trace(hypothesis, whole, left, vectors[:, seen]) if seen.any() else None
 
 
-def project_again(found: Sequence[Trace], project: Projector) -> list[Trace]:
-    """Traces as seen beside other free parameters than those they were simulated with."""
-    told = (_seen(trace.hypothesis, trace.whole, project) for trace in found)
-    return [trace for trace in told if trace is not None]
-
-
 def scores(found: Sequence[Trace], residual: Array) -> list[Score]:
     """Match traces with errors, best first.
 

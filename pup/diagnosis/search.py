@@ -73,7 +73,7 @@ def search(
     if not found:
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
-    selector = Selector(replays, nominal.noise, found, enough, nominal.fit)
+    selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
     start = selector.nominal

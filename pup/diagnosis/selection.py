@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.evidence import Projector, Score, Trace, project_again, scores
+from pup.diagnosis.evidence import Projector, Score, Trace, scores
 from pup.diagnosis.fitting import (
     Coordinate,
     Fit,
@@ -21,13 +21,13 @@ from pup.diagnosis.fitting import (
     term_coordinate,
 )
 from pup.diagnosis.folds import folds, left_out
-from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.gains import explains, material
+from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.shortlist import shortlist
 from pup.diagnosis.starts import ROUGHLY, joined, options, without_samples
-from pup.physics.terms import Place
-from pup.robot import RobotDescription
+from pup.diagnosis.tracing import traces
 
 Array = NDArray[np.float64]
 
@@ -46,18 +46,6 @@ KEPT = 0.25
 FORM = 0.03
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
 is no evidence of another."""
-REST = 0.3
-"""Share of what is more than noise at a joint that an effect explains. Many small effects make
-up for what the library does not know, and for a wrong form of what was found; a true one explains
-more."""
-SHOWN = 0.1
-"""Joints count that an effect gains this share of where it gains most."""
-ALIKE = 0.03
-"""The same share where the effect is known from another place: like servos do alike."""
-MATERIAL = 0.3
-"""An effect is material if it explains an error of this share of some joint's noise, ..."""
-SIZABLE = 0.25
-"""... or is of at least this share of its typical size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +113,10 @@ class Selector:
     Args:
       replays: simulates.
       noise: weighs the samples.
-      found: traces of all hypotheses around the nominal fit.
+      found: traces of all hypotheses around the nominal fit, or around `base`.
       enough: surprise that chance does not reach.
       nominal: the nominal fit, with its Jacobian.
+      base: the fit to start from, where some effects are known already.
     """
 
     def __init__(
@@ -137,12 +126,14 @@ class Selector:
         found: Sequence[Trace],
         enough: float,
         nominal: Fit,
+        base: Fit | None = None,
     ) -> None:
         self.replays = replays
         self.noise = noise
-        self.found = tuple(found)
+        self.found, self.base = tuple(found), base or nominal
         self.enough = enough
         self.folds = folds(replays)
+        self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
         self.nominal = self.predicting(self.model((), nominal))
 
     def run(self, start: Model) -> tuple[Model, list[Round]]:
@@ -216,9 +207,8 @@ class Selector:
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
         assert fit.jacobian is not None and fit.residual is not None
-        rest = [t for t in self.found if t.hypothesis.key not in {h.key for h in model.hypotheses}]
-        project = Projector(fit.jacobian)
-        ranking = scores(project_again(rest, project), project(fit.residual[:, None])[:, 0])
+        errors = Projector(fit.jacobian)(fit.residual[:, None])[:, 0]
+        ranking = scores(self._traces(model), errors)
         if not ranking or ranking[0].surprise < self.enough:
             return None
         chosen = shortlist(ranking, self.enough)
@@ -234,20 +224,15 @@ class Selector:
         others = [m for m in finalists if m not in holds]
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
-    def _explains(self, before: Model, after: Model) -> bool:
-        """Whether an effect explains much of what more than noise there is at one joint at least.
-
-        Others of its group may have troubles of their own besides.
-        """
-        measured, newest = self.replays.measured, after.hypotheses[-1]
-        own = _joints(newest.place, measured.robot)
-        then, now = (
-            _excess(fit, measured.channel, len(own))[own] for fit in (before.fit, after.fit)
-        )
-        gain = then - now
-        shown = gain >= SHOWN * gain.max()
-        share = ALIKE if newest.effect in _effects(before.hypotheses) else REST
-        return bool((gain > share * then)[shown].any())
+    def _traces(self, model: Model) -> list[Trace]:
+        """Traces of what a model does not have, around it: a large effect changes all others'."""
+        known = {h.key for h in model.hypotheses}
+        if model.fit is not self.base:
+            rest = [h for h in hypotheses(self.replays.measured) if h.key not in known]
+            self.found = tuple(traces(rest, model.fit, self.replays, self.noise))
+            self.base = model.fit
+            self._seen |= {t.hypothesis.key: t.basis.shape[1] for t in self.found}
+        return [t for t in self.found if t.hypothesis.key not in known]
 
     def blur(self, model: Model, share: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
@@ -284,9 +269,13 @@ class Selector:
         outside = float((before.held_out - after.held_out).sum())
         if outside <= max(KEPT * inside, 0.5 * self.enough):
             return False
-        if inside <= self.blur(before) or not self._explains(before, after):
+        if inside <= self.blur(before):
             return False
-        return _material(after.hypotheses[-1], before, after, self.replays.measured.channel)
+        newest, known = after.hypotheses[-1], _effects(before.hypotheses)
+        both, measured = (before.fit, after.fit), self.replays.measured
+        return explains(newest, *both, measured, newest.effect in known) and material(
+            newest, *both, measured
+        )
 
     def _started(self, model: Model, score: Score) -> tuple[tuple[Hypothesis, ...], Fit]:
         """A fit of a model with one effect more, where the score test says it lies."""
@@ -324,8 +313,7 @@ class Selector:
         return model
 
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
-        seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
-        return sum(seen[h.key] + len(h.continuous) for h in hypotheses)
+        return sum(self._seen[h.key] + len(h.continuous) for h in hypotheses)
 
     def _less(self, model: Model, hypothesis: Hypothesis) -> Fit:
         """A fit of the model without one of its effects."""
@@ -368,29 +356,3 @@ class Selector:
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
     return {hypothesis.effect for hypothesis in hypotheses}
-
-
-def _excess(fit: Fit, channel: NDArray[np.int64], channels: int) -> Array:
-    """What of each channel's chi-squared is more than noise."""
-    assert fit.residual is not None
-    return np.asarray(np.bincount(channel, fit.residual**2 - 1, minlength=channels), dtype=float)
-
-
-def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
-    """The channels of the joints at a place; all channels where it is none of some joints."""
-    chosen = np.zeros(len(robot.joints) + 2, dtype=bool)
-    joints = place.joints(robot)
-    chosen[joints if place.kind in ("joint", "group") else slice(None)] = True
-    return chosen
-
-
-def _material(
-    hypothesis: Hypothesis, before: Model, after: Model, channel: NDArray[np.int64]
-) -> bool:
-    """Whether an effect matters: by its size, or by the error it explains of some joint."""
-    at = dict(zip(after.fit.names, after.fit.at, strict=True))
-    if any(abs(at[name]) >= SIZABLE for name in hypothesis.magnitudes):
-        return True
-    assert before.fit.residual is not None and after.fit.residual is not None
-    explained = np.bincount(channel, before.fit.residual**2 - after.fit.residual**2)
-    return bool((explained > MATERIAL**2 * np.bincount(channel)).any())

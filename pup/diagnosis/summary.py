@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Score, Trace, overlap, scores
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.gains import MATERIAL
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.regimes import Window, windows
-from pup.diagnosis.selection import KEPT, MATERIAL, Model, Round
+from pup.diagnosis.selection import KEPT, Model, Round
 from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
 from pup.physics.terms import Place
 
