@@ -153,6 +153,7 @@ def test_trials_run_on_board_are_told_and_recorded(
         chunks = [c for c in gateway.of(RecordingChunk) if c.recording == fallen.recording]
         data = b"".join(c.data for c in sorted(chunks, key=lambda c: c.number))
         assert data == (folder / f"{fallen.recording}.parquet").read_bytes()
+        assert made.agent is not None and memory(made.agent.pid) < 120, "light after trials too"
 
 
 @pytest.mark.slow

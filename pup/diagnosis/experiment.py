@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import STEP, Fit, fit_together, term_coordinate
+from pup.diagnosis.fitting import Fit, difference, fit_together, term_coordinate
 from pup.diagnosis.laws import WORDS
 from pup.diagnosis.menu import Option, options
 from pup.diagnosis.replays import Replays, Row
@@ -257,8 +257,7 @@ def _answers(
             if (coordinate.name, owner) in moves:
                 continue
             at = rival.fit.at.copy()
-            step = STEP if coordinate.scale is None else 5 * STEP
-            at[i] += step if at[i] + step <= coordinate.upper else -step
+            at[i] += difference(rival.fit, i, at)
             moves[coordinate.name, owner] = len(rows), at[i] - rival.fit.at[i]
             rows.append(_on(rival.fit.row(at), other_floor))
     white = replays.measured.whiten(replays(rows), noise)

@@ -237,7 +237,7 @@ def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
 
 def _differences(fit: Fit, at: Array) -> tuple[Array, list[dict[str, float]]]:
     """Steps of the coordinates around a point, and the column that each sets."""
-    steps = np.array([_step(fit, i, at) for i in range(len(at))])
+    steps = np.array([difference(fit, i, at) for i in range(len(at))])
     moved = zip(fit.coordinates, at + steps, strict=True)
     return steps, [{c.name: c.value(x)} for c, x in moved]
 
@@ -297,8 +297,8 @@ def _chi2(fit: Fit, residual: Array) -> float:
     return float(weighted @ weighted)
 
 
-def _step(fit: Fit, i: int, at: Array) -> float:
-    """A finite difference into the range."""
+def difference(fit: Fit, i: int, at: Array) -> float:
+    """A step of a coordinate into its range, for a slope."""
     coordinate = fit.coordinates[i]
     step = fit.width * (STEP if coordinate.scale is None else 5 * STEP)
     return step if at[i] + step <= coordinate.upper else -step

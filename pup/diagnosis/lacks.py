@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.locate import MissingInput
-from pup.diagnosis.residuals import Measured
+from pup.diagnosis.residuals import Measured, repeats
 
 Array = NDArray[np.float64]
 
@@ -109,13 +109,3 @@ def _shared(parts: Sequence[tuple[Array, Array]]) -> Repeated:
     return Repeated(
         float(products.mean()), float(products.sum() / max(np.sqrt((known**2).sum()), 1e-300))
     )
-
-
-def repeats(measured: Measured) -> list[tuple[int, int]]:
-    """Pairs of recordings of one motion, the second a repeat of the first."""
-    names = {r.id: i for i, r in enumerate(measured.recordings)}
-    return [
-        (names[r.repeat_of], i)
-        for i, r in enumerate(measured.recordings)
-        if r.repeat_of is not None and r.repeat_of in names
-    ]

@@ -177,7 +177,7 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
       measured: the samples.
       errors: measured minus simulated, shape (n_samples,), rad.
     """
-    pairs = _repeats(measured)
+    pairs = repeats(measured)
     differences = [_difference(measured, errors, a, b) for a, b in pairs]
     told, readings = {}, []
     for channel in range(measured.channels):
@@ -289,7 +289,7 @@ def _moments(parts: Sequence[Array]) -> tuple[float, float]:
     return variance, float(np.mean(np.concatenate([p[1:] * p[:-1] for p in parts])))
 
 
-def _repeats(measured: Measured) -> list[tuple[int, int]]:
+def repeats(measured: Measured) -> list[tuple[int, int]]:
     """Pairs of recordings of one motion done again under one setup."""
     names = {r.id: i for i, r in enumerate(measured.recordings)}
     families: dict[str, list[int]] = {}
