@@ -1,11 +1,13 @@
 """Regret of the optimiser of eta against Ax, Optuna's GP sampler and nevergrad's CMA.
 
 Every optimiser walks the same robots: landscapes with a ridge, lower hills, a cliff and noise that
-grows with distance (tests/landscapes.py), or recorded ones from a file. After 10 and after 25 walks
-each names the eta it would keep, by the means that it has for that; regret is what that eta's
-expected distance falls short of the best one's, in percent of it.
+grows with distance (tests/landscapes.py), or those that `benchmarks.post_sysid` has recorded on
+virtual robots. After 10 and after 25 walks each names the eta it would keep, by the means that it
+has for that; regret is what that eta's expected distance falls short of the best one's, in percent
+of it.
 
     python -m benchmarks.optimisers --robots 20 --out optimisers.json
+    python -m benchmarks.optimisers --recorded results/landscape*.json --noise 0.02
 """
 
 import argparse
@@ -22,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import landscapes
@@ -30,6 +33,36 @@ Array = NDArray[np.float64]
 Session = Generator[tuple[Array, Array | None], Any, None]
 """Gives an eta to walk and the one it would keep by now; is sent the distance."""
 LOOKS = (10, 25)
+
+
+class Recorded:
+    """A landscape that was walked on a grid, linear between its points.
+
+    Args:
+      file: of `benchmarks.post_sysid`.
+      noise: of a walk, m.
+    """
+
+    def __init__(self, file: Path, noise: float) -> None:
+        told = json.loads(file.read_text())
+        sides = [len(axis) for axis in told["axes"]]
+        table = np.reshape(told["distance"], sides)
+        unit = [np.linspace(-1, 1, side) for side in sides]
+        self.noise = noise
+        self._between, self._best = RegularGridInterpolator(unit, table), float(table.max())
+
+    def expected(self, eta: Array) -> Array:
+        """Distance without noise, m; eta of shape (..., 3) over the box, each from -1 to 1."""
+        return np.asarray(self._between(np.clip(eta, -1, 1))).reshape(np.shape(eta)[:-1])
+
+    def walk(self, eta: Array, rng: np.random.Generator) -> Array:
+        """Distance as measured, m."""
+        mean = self.expected(eta)
+        return np.asarray(mean + rng.normal(0, self.noise, mean.shape))
+
+    def optimum(self) -> float:
+        """Largest expected distance, m."""
+        return self._best
 
 
 def ours(seed: int, simulated: Any = None) -> Session:
@@ -124,9 +157,10 @@ RIVALS: dict[str, tuple[Callable[[int], Session], str]] = {
 }
 
 
-def regrets(make: Callable[[int], Session], seed: int, noise: float, gap: float) -> dict[str, Any]:
+def regrets(
+    make: Callable[[int], Session], seed: int, robot: landscapes.Robot | Recorded
+) -> dict[str, Any]:
     """Regret in percent after each look, and the seconds that a suggestion took."""
-    robot = landscapes.Robot.draw(seed, noise, gap)
     rng = np.random.default_rng((seed, 4))
     best, session = robot.optimum(), make(seed)
     found: dict[str, Any] = {}
@@ -149,6 +183,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--noise", type=float, default=0.05, help="m")
     parser.add_argument("--gap", type=float, default=0.0, help="of a robot to its family, in eta")
+    parser.add_argument("--recorded", type=Path, nargs="+", help="landscapes of post_sysid")
     parser.add_argument("--only", nargs="+", default=list(RIVALS))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -157,14 +192,20 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     logging.disable(logging.WARNING)  # Ax tells of each trial
+    seeds = range(options.first, options.first + options.robots)
+    robots: list[landscapes.Robot | Recorded] = [
+        landscapes.Robot.draw(seed, options.noise, options.gap) for seed in seeds
+    ]
+    if options.recorded:
+        robots = [Recorded(file, options.noise) for file in options.recorded]
+        options.only = [name for name in options.only if RIVALS[name][0] is not warm]
     table: dict[str, Any] = {}
     for name in options.only:
         make, package = RIVALS[name]
         if find_spec(package) is None:
             print(f"{name}: skipped, {package} is not installed")
             continue
-        seeds = range(options.first, options.first + options.robots)
-        runs = [regrets(make, seed, options.noise, options.gap) for seed in seeds]
+        runs = [regrets(make, options.first + i, robot) for i, robot in enumerate(robots)]
         row: dict[str, Any] = {}
         for look in map(str, LOOKS):
             found = np.array([r[look] for r in runs])
@@ -186,7 +227,7 @@ def main() -> None:
         if options.out:
             document = {
                 "schema": 1,
-                "robots": options.robots,
+                "robots": len(robots),
                 "noise": options.noise,
                 "gap": options.gap,
             }

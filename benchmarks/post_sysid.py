@@ -88,7 +88,10 @@ class Plan:
                 warm = study("warm", self.trials, compare=[], simulated=self.simulated)
                 told["warm"] = _mean(warm, "repeat")
         grid = Grid(robot, policy, seed, cold["settings"]["horizon"])
-        told |= {"grid": grid.best(self.side), "agreement": grid.agreement(cold["trials"])}
+        told |= {
+            "grid": grid.best(self.side, self.out / f"landscape{seed}.json"),
+            "agreement": grid.agreement(cold["trials"]),
+        }
         write_json(self.file(seed), told)
 
 
@@ -109,18 +112,24 @@ class Grid:
             told.append(walk(fleet, self.policy, part, self.horizon, 1 / RATE, draw).distance)
         return np.concatenate(told)
 
-    def best(self, side: int) -> float:
+    def best(self, side: int, record: Path) -> float:
         """Mean distance of the best eta of a grid, m, told too large rather than too small.
 
         One walk of each chooses some, and five more walks of each of these choose the best and tell
         its mean: that is chosen by the walks that tell it.
+
+        Args:
+          side: points along each entry of eta.
+          record: file for the landscape, which `benchmarks.optimisers --recorded` takes.
         """
         card = self.policy.card
-        axes = [
-            np.linspace(*ends, side) for ends in zip(card.eta_lower, card.eta_upper, strict=True)
-        ]
+        ends = zip(card.eta_lower, card.eta_upper, strict=True)
+        axes = [np.linspace(*both, side) for both in ends]
         eta = np.array(list(itertools.product(*axes)))
-        chosen = eta[np.argsort(-self.walked(eta, 0))[:BEST]]
+        distance = self.walked(eta, 0)
+        told = {"axes": [axis.tolist() for axis in axes], "distance": distance.tolist()}
+        write_json(record, {"schema": 1, "seed": self.seed} | told)
+        chosen = eta[np.argsort(-distance)[:BEST]]
         again = [self.walked(chosen, draw) for draw in range(1, DRAWS + 1)]
         return float(np.mean(again, axis=0).max())
 

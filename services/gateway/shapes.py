@@ -18,9 +18,9 @@ ROLLOUTS = 2**16
 
 
 class Strict(BaseModel):
-    """A request: what it does not know, it refuses."""
+    """A request: what it does not know, it refuses, and texts for numbers too."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class SimulatedRollouts(Strict):
@@ -64,7 +64,7 @@ class NewStudy(Strict):
     horizon: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = Defaults.horizon
     lease: Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] = Defaults.lease
     failures: Annotated[int, Field(ge=1, le=1000)] = Defaults.failures
-    gate: Gate = Defaults.gate
+    gate: Annotated[Gate, Field(strict=False)] = Defaults.gate
     agent: Name | None = None
     warm_start: bool = Defaults.warm_start
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Defaults.seed
