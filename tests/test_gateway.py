@@ -95,11 +95,24 @@ def test_a_study_is_made_once_and_joined(service):
         {"seed": -1},
         {"simulated": {"eta": [[0, 0, 0], [1, 1, 1]], "distance": [[1, 2, 3]]}},
         {"simulated": {"eta": [[0, 0], [1, 1]], "distance": [[1, 2]]}},
+        {"seed": False},
+        {"trials": "5"},
+        {"trials": 5.5},
+        {"horizon": "15"},
+        {"warm_start": 1},
     ],
 )
 def test_studies_that_cannot_be_are_refused(service, wrong):
     with service.client() as http:
         is_problem(http.post("/v1/studies", json=STUDY | {"name": "wrong"} | wrong), 422)
+
+
+def test_a_whole_number_may_be_written_with_a_point(service):
+    asked = b'{"name": "whole", "robot": "darwin_op2", "policy": "%s", "trials": 5.0}' % (b"a" * 64)
+    with service.client() as http:
+        headers = {"Content-Type": "application/json"}
+        made = http.post("/v1/studies", content=asked, headers=headers)
+        assert (made.status_code, made.json()["settings"]["trials"]) == (201, 5)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from services.gateway.jobs import Job, JobState
 from services.gateway.keys import Role, User
 from services.gateway.problems import responses
 from services.gateway.records import Row, job_document
-from services.gateway.shapes import Retry, Strict
+from services.gateway.shapes import WITHOUT_FRACTION, Retry, Strict
 from services.job_arguments import COUNT, LENGTH, Verb
 
 CHUNK = 2**16
@@ -45,7 +45,7 @@ class NewJob(Strict):
     ] = Field([])
     cpus: Annotated[float, Field(gt=0, le=4096, allow_inf_nan=False)] = 1.0
     gpus: Annotated[float, Field(ge=0, le=64, allow_inf_nan=False)] = 0.0
-    retries: Annotated[int, Field(ge=0, le=100)] = 3
+    retries: Annotated[int, Field(ge=0, le=100), WITHOUT_FRACTION] = 3
 
 
 class AttemptShape(BaseModel):

@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 
 from pup.errors import InputError
 from pup.transfer.study import Gate, Purpose, StudyState, TrialState
@@ -11,6 +11,13 @@ from pup.transfer.study import StudySettings as Defaults
 from services.gateway.names import WHOLE
 from services.gateway.records import Row
 
+
+def _whole(told: Any) -> Any:
+    """A number without a fraction is whole, as JSON Schema has it, however it is written."""
+    return int(told) if isinstance(told, float) and told.is_integer() else told
+
+
+WITHOUT_FRACTION = BeforeValidator(_whole)
 Number = Annotated[FiniteFloat, Field(ge=-1e6, le=1e6)]
 Eta = Annotated[list[Number], Field(min_length=1, max_length=16)]
 Name = Annotated[str, Field(pattern=WHOLE)]
@@ -57,24 +64,24 @@ class NewStudy(Strict):
     policy: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of policy.json.")]
     lower: Eta = list(Defaults.lower)
     upper: Eta = list(Defaults.upper)
-    trials: Annotated[int, Field(ge=1, le=1000)] = Defaults.trials
-    initial: Annotated[int, Field(ge=1, le=1000)] = Defaults.initial
-    repeats: Annotated[int, Field(ge=0, le=100)] = Defaults.repeats
+    trials: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.trials
+    initial: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.initial
+    repeats: Annotated[int, Field(ge=0, le=100), WITHOUT_FRACTION] = Defaults.repeats
     compare: Annotated[list[Eta], Field(max_length=16)] = []
     horizon: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = Defaults.horizon
     lease: Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] = Defaults.lease
-    failures: Annotated[int, Field(ge=1, le=1000)] = Defaults.failures
+    failures: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.failures
     gate: Annotated[Gate, Field(strict=False)] = Defaults.gate
     agent: Name | None = None
     warm_start: bool = Defaults.warm_start
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = Defaults.seed
+    seed: Annotated[int, Field(ge=0, lt=2**31), WITHOUT_FRACTION] = Defaults.seed
     simulated: SimulatedRollouts | None = None
 
 
 class Retry(Strict):
     """An attempt to make."""
 
-    attempt: Annotated[int, Field(ge=1, le=10**6)]
+    attempt: Annotated[int, Field(ge=1, le=10**6), WITHOUT_FRACTION]
 
 
 class Reason(Strict):
