@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.knocks import knocked
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.physics.terms.scale import Scale
 from pup.recording import Recording
@@ -107,8 +108,9 @@ class Measured:
         ):
             elapsed = recording.time - recording.time[0]
             rows = np.arange(part.start, part.stop)
+            told = (elapsed >= SETTLING) & ~knocked(robot, recording)
             for channel, values in enumerate(_channels(robot, recording)):
-                kept = ~np.isnan(values) & (elapsed >= SETTLING)
+                kept = ~np.isnan(values) & told
                 where = rows * joints + channel
                 if channel >= joints:
                     where = ticks * joints + rows * 2 + channel - joints
