@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from hardware_agent.virtual.fleet import Fleet
 from hardware_agent.virtual.walks import walk
+from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
@@ -68,7 +69,15 @@ class Plan:
         return self.out / f"robot{seed}.json"
 
     def one(self, seed: int) -> None:
-        """All studies and the grid on the robot of a seed, written down."""
+        """All studies and the grid on the robot of a seed, or why it gives none, written down."""
+        told = {"schema": 1, "policy": sha256(self.policy / CARD), "seed": seed}
+        try:
+            told |= self._walked(seed)
+        except InputError as error:
+            told["failed"] = str(error)
+        write_json(self.file(seed), told)
+
+    def _walked(self, seed: int) -> dict[str, Any]:
         robot = RobotDescription.load(self.robot)
         policy = NumpyPolicy.load(self.policy, robot)
         fitted = fitted_eta(policy, read_bounds(robot.identified_path, robot)).tolist()
@@ -81,18 +90,16 @@ class Plan:
                 return follow(laboratory, name, budget, out=place, told=lambda _: None, **more)
 
             cold = study("cold", 25, compare=[fitted])
-            told = {"schema": 1, "policy": sha256(self.policy / CARD), "seed": seed}
-            told |= {"cold": _mean(cold, "repeat"), "fitted": _mean(cold, "compare")}
-            told |= {"eta": cold["eta"]}
+            told = {"cold": _mean(cold, "repeat"), "fitted": _mean(cold, "compare")}
+            told["eta"] = cold["eta"]
             if self.simulated is not None:
                 warm = study("warm", self.trials, compare=[], simulated=self.simulated)
                 told["warm"] = _mean(warm, "repeat")
         grid = Grid(robot, policy, seed, cold["settings"]["horizon"])
-        told |= {
+        return told | {
             "grid": grid.best(self.side, self.out / f"landscape{seed}.json"),
             "agreement": grid.agreement(cold["trials"]),
         }
-        write_json(self.file(seed), told)
 
 
 @dataclass(frozen=True)
@@ -173,15 +180,19 @@ def main() -> None:
             done.result()
             print(json.dumps(read_json(plan.file(seed))), flush=True)
         rows = [read_json(plan.file(seed)) for seed in seeds]
+    walked = [row for row in rows if "failed" not in row]
+    print(f"{len(walked)} of {len(rows)} robots gave results; the others count as 0")
+    if not walked:
+        return
     for name in ("cold", "warm", "fitted"):
-        shares = [row[name] / row["grid"] for row in rows if row.get(name) is not None]
-        if shares:
+        if name in walked[0]:
+            shares = [row[name] / row["grid"] if row in walked else 0.0 for row in rows]
             told = f"median {statistics.median(shares):.3f}, least {min(shares):.3f}"
             print(f"{name}: {told} of the best of the grid")
-    both = [row["warm"] / row["cold"] for row in rows if row.get("warm") is not None]
-    if both:
+    if "warm" in walked[0]:
+        both = [row["warm"] / row["cold"] for row in walked]
         print(f"warm of cold: median {statistics.median(both):.3f}, least {min(both):.3f}")
-    print(f"with and without the bus: {max(row['agreement'] for row in rows):.3f} m at most")
+    print(f"with and without the bus: {max(row['agreement'] for row in walked):.3f} m at most")
 
 
 if __name__ == "__main__":
