@@ -62,6 +62,27 @@ def test_a_concealed_effect_is_named_and_measured(
     assert told.held_out.after == pytest.approx(0.00205, rel=0.1)  # the noise, quantised
 
 
+def test_what_a_large_effect_hides_is_found_beside_it() -> None:
+    """Each round looks around its own model: what else is missing does other things there."""
+    missing = {
+        f"torque_speed_limit/slope@{SERVO}": 0.03,
+        f"derivative_kick/gain@{SERVO}": 0.3,
+        f"derivative_kick/time@{SERVO}": 0.015,
+    }
+    told = found(missing)
+    assert {finding.effect for finding in told.findings} == {
+        "torque_speed_limit",
+        "derivative_kick",
+    }
+    first, second = told.rounds[:2]
+    around = {score.trace.hypothesis: score.trace for score in first.ranking}
+    again = next(
+        s.trace for s in second.ranking if s.trace.hypothesis.effect == second.chosen.effect
+    )
+    before = around[again.hypothesis]
+    assert np.linalg.norm(again.whole - before.whole) > 0.1 * np.linalg.norm(before.whole)
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 def test_nothing_is_found_where_nothing_is_missing(seed: int) -> None:
     told = found({}, seed)

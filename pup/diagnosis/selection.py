@@ -313,7 +313,8 @@ class Selector:
         return model
 
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
-        return sum(self._seen[h.key] + len(h.continuous) for h in hypotheses)
+        seen = self._seen
+        return sum(seen.get(h.key, len(h.magnitudes)) + len(h.continuous) for h in hypotheses)
 
     def _less(self, model: Model, hypothesis: Hypothesis) -> Fit:
         """A fit of the model without one of its effects."""
