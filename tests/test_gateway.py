@@ -108,7 +108,7 @@ def test_studies_that_cannot_be_are_refused(service, wrong):
 
 
 def test_a_whole_number_may_be_written_with_a_point(service):
-    asked = b'{"name": "whole", "robot": "darwin_op2", "policy": "%s", "trials": 5.0}' % (b"a" * 64)
+    asked = b'{"name": "point", "robot": "darwin_op2", "policy": "%s", "trials": 5.0}' % (b"a" * 64)
     with service.client() as http:
         headers = {"Content-Type": "application/json"}
         made = http.post("/v1/studies", content=asked, headers=headers)
@@ -246,7 +246,8 @@ def test_a_whole_study_tells_why_it_decided(service):
     walk = fake_agent.walks(lambda eta: 0.8 - 0.2 * sum((x - 0.3) ** 2 for x in eta))
     asked = STUDY | {"name": "whole", "agent": "whole-1", "trials": 7, "repeats": 2}
     with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk):
-        http.post("/v1/studies", json=asked | {"compare": [[0, 0, 0]]})
+        made = http.post("/v1/studies", json=asked | {"compare": [[0, 0, 0]]})
+        assert made.status_code == 201, made.text
         done = service.wait_for("whole")
         trials = service.trials("whole")
         purposes = [t["purpose"] for t in trials]
