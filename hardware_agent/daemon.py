@@ -76,6 +76,7 @@ class Agent:
         self._link = Link(settings.link, self._hello) if settings.link.gateway else None
         self._control = ControlServer(settings.socket, self.answer)
         self._stopper: subprocess.Popen[bytes] | None = None
+        self._stopper_end = -1
         self._ending = False
         self._beaten = self._resent = 0.0
         self._seen: AgentState | None = None
@@ -180,10 +181,13 @@ class Agent:
         poller.register(self._bell, zmq.POLLIN)
         for socket in self._link.sockets if self._link else ():
             poller.register(socket, zmq.POLLIN)
+        if self._stopper is not None:
+            poller.register(self._stopper_end, zmq.POLLIN)
         poller.poll(round(TURN * 1000))
         with suppress(BlockingIOError):
             os.eventfd_read(self._bell)
         if self._stopper is not None and self._stopper.poll() is not None:
+            os.close(self._stopper_end)
             self._stopper = None
             self._motion.stop("the emergency stop's command has ended")
 
@@ -232,6 +236,7 @@ class Agent:
         if command and self._stopper is None:
             try:
                 self._stopper = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+                self._stopper_end = os.pidfd_open(self._stopper.pid)  # wakes who waits for it
             except OSError as error:
                 raise InputError(f"stop.command: {command[0]}: {error.strerror}") from error
 
