@@ -52,7 +52,7 @@ def main() -> None:
     what.add_parser("jitter").add_argument("--minutes", type=float, default=10.0)
     stop = what.add_parser("stops")
     stop.add_argument("--repeats", type=int, default=100)
-    stop.add_argument("--only", default="", help="triggers whose name has this")
+    stop.add_argument("--only", nargs="+", default=(), help="triggers whose name has this")
     options = parser.parse_args()
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:

@@ -184,6 +184,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.05, help="m")
     parser.add_argument("--gap", type=float, default=0.0, help="of a robot to its family, in eta")
     parser.add_argument("--recorded", type=Path, nargs="+", help="landscapes of post_sysid")
+    parser.add_argument("--repeats", type=int, default=1, help="of each robot, by another seed")
     parser.add_argument("--only", nargs="+", default=list(RIVALS))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -199,6 +200,7 @@ def main() -> None:
     if options.recorded:
         robots = [Recorded(file, options.noise) for file in options.recorded]
         options.only = [name for name in options.only if RIVALS[name][0] is not warm]
+    robots = robots * options.repeats
     table: dict[str, Any] = {}
     for name in options.only:
         make, package = RIVALS[name]
@@ -227,7 +229,8 @@ def main() -> None:
         if options.out:
             document = {
                 "schema": 1,
-                "robots": len(robots),
+                "robots": len(robots) // options.repeats,
+                "repeats": options.repeats,
                 "noise": options.noise,
                 "gap": options.gap,
             }

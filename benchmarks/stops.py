@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -69,13 +69,18 @@ class Bench:
         """Processes that the agent started, by their command; the dead have none."""
         return [c for c in children(self.agent) if name in Path(f"/proc/{c}/cmdline").read_text()]
 
-    def walk(self, policy: Path) -> None:
-        """Begin a trial."""
+    def walk(self, policy: Path) -> bool:
+        """Begin a trial; False where the robot was stopped before it walked."""
         trial = f"t{next(self._trial)}"
         before = len(self.gateway.of(Running))
         study = ("stops", trial, 1, 1, digest_of(policy), (0.0, 0.5, -0.5), 15.0)
         self.gateway.send(Assign(*study))
-        wait(lambda: len(self.gateway.of(Running)) > before, 20, self.made.log)
+
+        def walks() -> bool:
+            return len(self.gateway.of(Running)) > before
+
+        wait(lambda: walks() or self.made.health()["state"] == "fault", 20, self.made.log)
+        return walks()
 
 
 def enable(made: Lab) -> None:
@@ -165,7 +170,7 @@ TRIGGERS = {
 }
 
 
-def stops(folder: Path, repeats: int, named: str = "") -> dict[str, Any]:
+def stops(folder: Path, repeats: int, names: Sequence[str] = ()) -> dict[str, Any]:
     """Time from each trigger to torque off on the bus, in control periods.
 
     A stop whose reason is another than the trigger's is not counted: on a busy machine the virtual
@@ -174,10 +179,14 @@ def stops(folder: Path, repeats: int, named: str = "") -> dict[str, Any]:
     Args:
       folder: for labs; empty.
       repeats: of each trigger.
-      named: only triggers whose name has this.
+      names: only triggers whose name has one of these; empty for all.
     """
     rng = np.random.default_rng(0)
-    chosen = {name: trigger for name, trigger in TRIGGERS.items() if named in name}
+    chosen = {
+        name: trigger
+        for name, trigger in TRIGGERS.items()
+        if not names or any(part in name for part in names)
+    }
     told = {}
     for number, settings in enumerate(dict.fromkeys(t.settings for t in chosen.values())):
         place = folder / f"lab{number}"
@@ -213,9 +222,8 @@ def _repeated(
         _start(bench)
         enable(bench.made)
         count = len(bench.tap.safes)
-        if trigger.policy:
-            bench.walk(policies[trigger.policy])
-        seconds = _until_safe(bench, trigger, count, rng)
+        ready = not trigger.policy or bench.walk(policies[trigger.policy])
+        seconds = _until_safe(bench, trigger, count, rng) if ready else None
         if seconds is not None and _is_why(bench, trigger):
             took.append(seconds / PERIOD)
         else:
