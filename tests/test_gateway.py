@@ -5,6 +5,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
+import psutil
 import pytest
 
 pytest.importorskip("fastapi")
@@ -13,6 +14,8 @@ pytest.importorskip("botorch")
 import fake_agent
 import gateways
 from gateways import STUDY
+
+from services.gateway.config import Config
 
 READS = ("/v1/studies", "/v1/studies/x", "/v1/studies/x/trials", "/v1/studies/x/posterior")
 READS += ("/v1/studies/x/history", "/v1/studies/x/events", "/v1/agents", "/metrics")
@@ -263,6 +266,13 @@ def test_a_whole_study_tells_why_it_decided(service):
         metrics = http.get("/metrics").text
         assert 'pup_agent_health{agent="whole-1",name="temperature"} 41.5' in metrics
         assert "pup_suggest_seconds_count" in metrics
+
+
+def test_untold_it_listens_on_loopback_alone(service):
+    own = psutil.Process(service.process.pid)
+    heard = {c.laddr.ip for c in own.net_connections() if c.status == psutil.CONN_LISTEN}
+    assert heard == {"127.0.0.1"}
+    assert Config().loopback and Config().link.startswith("tcp://127.0.0.1:")
 
 
 def test_the_log_is_json_and_holds_no_token(service):
