@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 Session = Generator[tuple[Array, Array | None], Any, None]
 """Gives an eta to walk and the one it would keep by now; is sent the distance."""
 LOOKS = (10, 25)
+LEAST = 0.3
+"""Of the best eta, m; on a recorded landscape with less no eta walks, and no optimiser can tell."""
 
 
 class Recorded:
@@ -198,7 +200,10 @@ def main() -> None:
         landscapes.Robot.draw(seed, options.noise, options.gap) for seed in seeds
     ]
     if options.recorded:
-        robots = [Recorded(file, options.noise) for file in options.recorded]
+        recorded = {file: Recorded(file, options.noise) for file in options.recorded}
+        robots = [made for made in recorded.values() if made.optimum() > LEAST]
+        for file in (f for f, made in recorded.items() if made.optimum() <= LEAST):
+            print(f"{file}: left out, no eta walks {LEAST:g} m")
         options.only = [name for name in options.only if RIVALS[name][0] is not warm]
     robots = robots * options.repeats
     table: dict[str, Any] = {}

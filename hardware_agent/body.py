@@ -1,6 +1,7 @@
 """The robot as the control loop sees it: its senses, its goals, and being made safe."""
 
 import math
+import time
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 
 TILT = 1.0  # rad, of a robot without a gait
+DOUBT = 2.0  # s, from which on a servo that does not say that it is limp is a problem
 
 
 class Body:
@@ -60,6 +62,8 @@ class Body:
         self._imu_seen = -math.inf
         self._written = -math.inf
         self.goal = np.full(n, math.nan)
+        self._doubted = set(range(n))
+        self._limp_since = time.monotonic()
 
     def open(self) -> list[str]:
         """Take the bus and the IMU; the servos are limp afterwards.
@@ -131,6 +135,8 @@ class Body:
             status = answers.servos.get(number)
             if status is None:
                 continue
+            if not self.torque and now - self._seen[j] > self.settings.safety.stale:
+                self._doubted.add(j)  # it was away, and did not hear that it shall be limp
             self._seen[j] = now
             for kind, values in self._known.items():
                 told = getattr(status, kind)
@@ -146,13 +152,20 @@ class Body:
         Returns:
           Why not, if so.
         """
-        if np.isnan(senses.position).any() or (senses.has_imu and senses.imu is None):
-            return Trip("enable", "the pose is not known: not every sensor has answered yet")
+        stale = senses.time - senses.seen > self.settings.safety.stale
+        blind = senses.has_imu and senses.time - senses.imu_seen > self.settings.safety.stale
+        if stale.any() or np.isnan(senses.position).any() or blind:
+            silent = ", ".join(self.names[j] for j in np.flatnonzero(stale)[:3]) or "the IMU"
+            return Trip("enable", f"the pose is not known: {silent} does not answer")
         self.guard.reset()
         self.goal, self._written = senses.position.copy(), senses.time
-        self.bus.prepare(self.goal, self.settings.safety.late)
+        deaf = self.bus.prepare(self.goal, self.settings.safety.late)
+        if deaf:
+            told = ", ".join(self.names[self.ids.index(number)] for number in deaf[:3])
+            return Trip("enable", f"{told} did not take its goal")
         self.bus.torque(True)
         self.torque = True
+        self._doubted.clear()
         return None
 
     def command(self, target: Array, now: float) -> Applied | Trip:
@@ -190,9 +203,41 @@ class Body:
                 pass
         self.limp()
 
+    @property
+    def doubted(self) -> bool:
+        """Whether a servo may still hold, though all shall be limp."""
+        return bool(self._doubted)
+
+    @property
+    def long_doubted(self) -> tuple[str, ...]:
+        """Joints of those that have not told of it for long."""
+        if self.torque or time.monotonic() - self._limp_since < DOUBT:
+            return ()
+        return tuple(self.names[j] for j in sorted(self._doubted))
+
+    def confirm_limp(self, senses: Senses) -> None:
+        """Ask one servo a tick whether it is limp, and tell all once more where it is not.
+
+        Torque off is told by packets that nobody answers: noise may have spoilt them, and a servo
+        whose cable was out has never got them.
+
+        Raises:
+          BusError: the bus is gone.
+        """
+        there = [j for j in sorted(self._doubted) if senses.seen[j] == senses.time]
+        if not there:
+            return
+        holds = self.bus.torque_enabled(self.ids[there[0]])
+        if holds:
+            self.bus.torque(False)
+        elif holds is not None:
+            self._doubted.discard(there[0])
+
     def limp(self) -> bool:
         """Torque off; False when the bus does not take it."""
         self.torque = False
+        self._doubted = set(range(len(self.names)))
+        self._limp_since = time.monotonic()
         try:
             self.bus.torque(False)
         except BusError:

@@ -11,7 +11,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
+import numpy as np
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+from numpy.typing import NDArray
 
 from hardware_agent.config import BusSettings
 from hardware_agent.port import FAILURES, BusError, Port, device_error
@@ -25,6 +27,8 @@ from hardware_agent.registers import (
     ticks,
 )
 from pup.errors import InputError
+
+Array = NDArray[np.float64]
 
 POWER_UP = 0.3  # s until servos answer after the board gave them current (e-manual)
 PAUSE = 0.02  # s after a silence: an answer says not to which question, and may only be late
@@ -81,7 +85,7 @@ class Bus:
         self._port.close()
         self.take()
         with self._told():
-            if self.settings.board is not None:
+            if self.settings.board:
                 self._power(self.settings.board)
             self.torque(False)
             missing = [name for name in self.ids if self._register(name, (0, 2)) is None]
@@ -131,6 +135,8 @@ class Bus:
         while not whole and tries < self.settings.tries:
             tries += 1
             left = [name for name in self.ids if name not in found]
+            if tries > 1:  # Protocol 1.0: who is silent first has silenced those behind it
+                left = [*left[1:], *left[:1]]
             with self._told():
                 self._ask(left, detailed, board)
                 self._collect(left, detailed, found, board)
@@ -150,12 +156,15 @@ class Bus:
         for _ in range(WRITES):
             self._all(self.registers.torque_enable, int(on))
 
-    def prepare(self, goals: Iterable[float], deadline: float) -> None:
+    def prepare(self, goals: Sequence[float] | Array, deadline: float) -> list[int]:
         """Set limp servos up such that they stay where they are when torque comes.
 
         Args:
           goals: where they are, rad.
           deadline: s without an instruction after which servos that can stop by themselves.
+
+        Returns:
+          Servos that have another goal all the same, or do not say.
         """
         own = self.registers
         for span, value in zip(own.gains, self.settings.gains or own.paper, strict=True):
@@ -166,6 +175,9 @@ class Bus:
             self._all(own.bus_watchdog, 0)  # one that has bitten refuses goals until told so
             self._all(own.bus_watchdog, min(127, math.ceil(deadline / 0.02)))
         self.write(goals)
+        wanted = {name: ticks(goal) for name, goal in zip(self.ids, goals, strict=True)}
+        with self._told():
+            return [name for name, goal in wanted.items() if self._register(name, own.goal) != goal]
 
     def soften(self, share: float) -> None:
         """Limit the servos' power to a share of what they have."""
@@ -201,7 +213,7 @@ class Bus:
     def _ask(self, left: Sequence[int], detailed: Collection[int], board: dict[int, bytes]) -> None:
         port, own = self._use(), self.registers
         asked = list(left)
-        if self._senses and not board and self.settings.board is not None:
+        if self._senses and not board and self.settings.board:
             asked.append(self.settings.board)
         if self.settings.read == "sync":
             address, length = own.block
@@ -234,7 +246,7 @@ class Bus:
         protocol = self.registers.protocol
         at = ERROR[protocol]
         wanted = set(left)
-        if self._senses and not board and self.settings.board is not None:
+        if self._senses and not board and self.settings.board:
             wanted.add(self.settings.board)
         more = () if protocol == 1 else (False,)
         while wanted:
@@ -320,6 +332,8 @@ class Bus:
 
     def _use(self) -> Port:
         """The port, free: with one owner and one thread, nobody else can be using it."""
+        if not self._port.is_open:
+            raise BusError(f"{self.settings.port}: is not open")
         self._port.is_using = False
         return self._port
 

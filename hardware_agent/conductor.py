@@ -4,8 +4,9 @@ accepted → (enabled, cool, and let start by whoever stands there) armed → st
 feet → settled → written down as running → walking → ended → distance → finished.
 """
 
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from enum import StrEnum
 from pathlib import Path
@@ -35,7 +36,10 @@ from pup.wire import (
     Sample,
 )
 
+log = logging.getLogger("pup-agent")
+
 SAMPLES = 0.2  # s between two samples
+LONGEST = 600.0  # s, of a walk
 COOL = "cool"  # what a trial waits for while a winding is hot
 
 
@@ -102,7 +106,7 @@ class Conductor:
         Raises:
           InputError: there is none that waits for it.
         """
-        if self.stage is not Stage.WAITING:
+        if self.stage is not Stage.WAITING or self.waiting != "arm":
             raise InputError("no trial waits to be started")
         self._armed = True
 
@@ -135,7 +139,8 @@ class Conductor:
         """The gateway takes a trial back."""
         answers, end = self._book.cancelled(cancel)
         self._send(*answers)
-        mine = self._assign is not None and cancel.trial == self._assign.trial
+        told = bool(answers) or end  # an older fence's is not heard
+        mine = told and self._assign is not None and _key(cancel) == _key(self._assign)
         if mine and (end or self.stage in (Stage.POSING, Stage.PLACING, Stage.SETTLING)):
             self._motion.cancel("cancelled")
 
@@ -178,15 +183,23 @@ class Conductor:
             policy = self._shelf.load(assign.policy)
             self._rollout = Rollout(policy, assign.eta, self._settings.control.rate)
             self._direction = policy.card.direction
+            self._check(assign, policy.card.observation)
         except InputError as error:
             self._finish(Outcome.ABORTED, str(error))
             return
         self.stage, self._armed = Stage.WAITING, False
 
+    def _check(self, assign: Assign, observation: Sequence[str]) -> None:
+        if not 0 < assign.horizon <= LONGEST:
+            raise InputError(f"a horizon of {assign.horizon:g} s is not between 0 and {LONGEST:g}")
+        if self._settings.imu.kind == "none" and any(n.startswith("imu") for n in observation):
+            raise InputError("the policy wants to see an IMU, and imu.kind is none")
+
     def _start(self) -> None:
         assert self._assign is not None and self._rollout is not None
         self.waiting = self._obstacle()
         if self.waiting:
+            self._armed = False  # who let it start did so in another situation
             return
         refused = self._motion.prepare(self._assign, self._rollout, self._upright())
         if refused is not None:
@@ -218,7 +231,8 @@ class Conductor:
 
     def _begin(self) -> None:
         assert self._assign is not None
-        if self._book.current is None or self._book.current.trial != self._assign.trial:
+        current = self._book.current
+        if current is None or _key(current) != _key(self._assign):
             self._motion.cancel("cancelled")
             return
         self._send(self._book.begin(self._assign))
@@ -273,8 +287,12 @@ class Conductor:
         notes = f"eta {list(event.assign.eta)}; policy {event.assign.policy}; {event.reason}"
         made = recording_of(event.assign, event.rollout, self._robot.name, control.source, notes)
         file = self._file(made.id)
-        made.write(file)
-        return made.id, sha256(file)
+        try:
+            made.write(file)
+            return made.id, sha256(file)
+        except OSError as error:  # the walk counts all the same
+            log.error("recording %s is lost: %s", made.id, error)
+            return None
 
     def _finish(self, outcome: Outcome, reason: str, distance: float | None = None) -> None:
         assert self._assign is not None
@@ -307,3 +325,7 @@ class Conductor:
     def _fence(self) -> int:
         assert self._assign is not None
         return self._book.fence(self._assign)
+
+
+def _key(told: Assign | Cancel) -> tuple[str, int]:
+    return told.trial, told.attempt

@@ -29,6 +29,7 @@ from hardware_agent.link import Link
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.port import BusError, BusyError
+from hardware_agent.status import brief
 from hardware_agent.systemd import notify
 from hardware_agent.trials import TrialBook
 from hardware_agent.watchdog import Watchdog
@@ -168,6 +169,9 @@ class Agent:
                 done.set_result(call())
             except InputError as error:
                 done.set_exception(error)
+            except Exception as error:  # a command must not end who holds the robot
+                log.exception("a command failed")
+                done.set_exception(InputError(f"the agent failed at it: {brief(str(error))}"))
         if self._link is not None:
             for message in self._link.receive():
                 self._receive(message)
@@ -224,9 +228,12 @@ class Agent:
         if do == "arm":
             self._conductor.arm()
         elif do == "skip":
-            self._conductor.skip(str(command.get("reason", "skipped by the operator")))
+            self._conductor.skip(brief(str(command.get("reason", "skipped by the operator"))))
         elif do == "distance":
-            self._conductor.measured(float(command.get("distance", "nan")))
+            told = command.get("distance")
+            if isinstance(told, bool) or not isinstance(told, int | float):
+                raise InputError("distance is no number of metres")
+            self._conductor.measured(float(told))
         else:
             raise InputError(f"{do!r} is no command of this agent")
 

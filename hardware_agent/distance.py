@@ -114,7 +114,7 @@ class Hook:
                 timeout=self._settings.timeout,
                 stdin=subprocess.DEVNULL,
             )
-        except (OSError, subprocess.TimeoutExpired) as error:
+        except (OSError, UnicodeDecodeError, subprocess.TimeoutExpired) as error:
             raise DistanceError(f"the distance hook failed ({error})") from error
         if done.returncode:
             last = (done.stderr.strip().splitlines() or [""])[-1][:200]

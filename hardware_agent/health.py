@@ -74,6 +74,10 @@ def _problems(
         problems.append(f"the control loop has not ticked for {silent:.1f} s")
     if status.bus and status.state is AgentState.FAULT:
         problems.append(status.reason)
+    if status.doubted:
+        told = ", ".join(status.doubted[:3])
+        more = f" and {len(status.doubted) - 3} more" if len(status.doubted) > 3 else ""
+        problems.append(f"{told}{more}: not known to be limp")
     limit = LATE / settings.control.rate
     if settings.control.clock == "wall" and status.timing.p99 > limit:
         problems.append(f"the control loop is late: p99 of its period {status.timing.p99:.4f} s")

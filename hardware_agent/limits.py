@@ -42,6 +42,10 @@ class Limiter:
         self._lower, self._upper = lower, upper
         self._speed = limits.speed
 
+    def within(self, pose: Array) -> Array:
+        """The pose within all ranges that is nearest to one."""
+        return np.clip(pose, self._lower, self._upper)
+
     def apply(self, target: Array, last: Array, step: float) -> Applied | Trip:
         """A target as it may be sent.
 
@@ -58,7 +62,9 @@ class Limiter:
         if len(wrong) or target.shape != last.shape:
             names = ", ".join(self._names[j] for j in wrong[:3])
             return Trip("bad target", f"the target of {names or 'some joints'} is no number")
-        ranged = np.clip(target, self._lower, self._upper)
+        # From beyond its range, where somebody may have turned it, a joint may come back slowly.
+        lower, upper = np.minimum(self._lower, last), np.maximum(self._upper, last)
+        ranged = np.clip(target, lower, upper)
         goal = np.clip(ranged, last - self._speed * step, last + self._speed * step)
         limited = {self._names[j]: "range" for j in np.flatnonzero(ranged != target)}
         limited |= {self._names[j]: "speed" for j in np.flatnonzero(goal != ranged)}

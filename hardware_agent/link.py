@@ -5,6 +5,7 @@ socket is thrown away and a new one made, later each time. Paranoid pirate: hear
 for a connection proves nothing about the programs at its ends.
 """
 
+import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,8 @@ import zmq.auth
 from hardware_agent.config import LinkSettings
 from pup.errors import InputError
 from pup.wire import SIZE_LIMIT, Body, Message, WireError, decode, encode
+
+log = logging.getLogger("pup-agent")
 
 QUEUE = 64  # messages that wait for the gateway; what counts is resent from the journal
 LONGEST = 30.0  # s between two tries to connect
@@ -85,6 +88,8 @@ class Link:
                 self._socket.send(encode(Message(body)), zmq.NOBLOCK)
             except zmq.Again:
                 return
+            except WireError as error:
+                log.error("%s cannot be sent: %s", type(body).__name__, error)
 
     def receive(self) -> list[Message]:
         """What has come; what is no message is counted and dropped."""

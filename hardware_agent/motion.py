@@ -32,9 +32,10 @@ from hardware_agent.body import Body
 from hardware_agent.limits import Applied
 from hardware_agent.metronome import Metronome
 from hardware_agent.port import BusError
+from hardware_agent.request import Request
 from hardware_agent.rollout import Rollout
 from hardware_agent.senses import Response, Senses, Trip
-from hardware_agent.status import MotionStatus, Refused
+from hardware_agent.status import MotionStatus, Refused, brief
 from hardware_agent.watchdog import Watchdog
 from pup.errors import InputError
 from pup.wire import AgentState, Assign, Outcome
@@ -64,7 +65,7 @@ class Motion(threading.Thread):
         self._emit = emit
         self._events: list[Event] = []
         self.metronome = Metronome(1 / self._settings.rate, self._settings.clock == "lockstep")
-        self._requests: queue.SimpleQueue[Callable[[Senses], Refused | None]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self._wake = threading.Event()
         self._stop_reason: str | None = None
         self._quit = False
@@ -81,7 +82,7 @@ class Motion(threading.Thread):
 
     def stop(self, reason: str) -> None:
         """The emergency stop: limp at once, not at the next tick."""
-        self._stop_reason = reason
+        self._stop_reason = brief(reason)
         self._wake.set()
 
     def enable(self) -> Refused | None:
@@ -126,17 +127,11 @@ class Motion(threading.Thread):
         if self.ident is not None:
             self.join(timeout=5.0)
 
-    def _ask(self, request: Callable[[Senses], Refused | None]) -> Refused | None:
-        done: queue.SimpleQueue[Refused | None] = queue.SimpleQueue()
-
-        def run(senses: Senses) -> None:
-            done.put(request(senses))
-
-        self._requests.put(run)
-        try:
-            return done.get(timeout=2.0)
-        except queue.Empty:
-            return Refused(f"the control loop does not run: {self.status.reason or 'no bus'}")
+    def _ask(self, act: Callable[[Senses], Refused | None]) -> Refused | None:
+        request = Request(act)
+        self._requests.put(request)
+        refused = Refused(f"the control loop does not run: {self.status.reason or 'no bus'}")
+        return request.wait(2.0, refused)
 
     # The loop.
 
@@ -164,10 +159,13 @@ class Motion(threading.Thread):
             senses = self._body.sense(now, walking)
             if self._body.torque:
                 self._move(senses)
+            else:
+                self._body.confirm_limp(senses)
             self._serve(senses)
         except BusError as error:
             self._bus = False
             self._trip(Trip("bus", str(error)), None)
+            self._refuse_all(f"bus: {error}")
             self._tell()
             senses = None
         busy = isinstance(self._activity, Ramp | Settle | Walk)
@@ -180,7 +178,7 @@ class Motion(threading.Thread):
     def _serve(self, senses: Senses) -> None:
         """Tell what happened, and do what is asked."""
         while (request := self._next(self._tell())) is not None:
-            request(senses)
+            request.run(senses)
 
     def _tell(self) -> float:
         """Tell what happened; returns for how long time may stand still until it is answered, s."""
@@ -193,7 +191,7 @@ class Motion(threading.Thread):
             self._emit(event)
         return STANDSTILL if answered and self.metronome.lockstep else 0.0
 
-    def _next(self, patience: float) -> Callable[[Senses], Refused | None] | None:
+    def _next(self, patience: float) -> "Request | None":
         deadline = time.monotonic() + patience
         while self._requests.empty() and time.monotonic() < deadline:
             if self._stop_reason is not None or self._quit:
@@ -201,7 +199,14 @@ class Motion(threading.Thread):
             self._beat()
             with suppress(queue.Empty):
                 return self._requests.get(timeout=BEAT)
-        return None if self._requests.empty() else self._requests.get()
+        if self._requests.empty() or self._stop_reason is not None:
+            return None
+        return self._requests.get()
+
+    def _refuse_all(self, reason: str) -> None:
+        """What was asked before a stop is not done after it."""
+        while not self._requests.empty():
+            self._requests.get().refuse(Refused(reason))
 
     def _move(self, senses: Senses) -> None:
         """Ask the rules, then the activity, and send its target."""
@@ -260,6 +265,7 @@ class Motion(threading.Thread):
 
     def _stopped(self) -> None:
         self._trip(Trip("stop", self._stop_reason or ""), None)
+        self._refuse_all(f"stop: {self._stop_reason}")
         self._stop_reason = None
         self._wake.clear()
 
@@ -278,6 +284,8 @@ class Motion(threading.Thread):
     # What requests do, in this thread.
 
     def _enable(self, senses: Senses) -> Refused | None:
+        if _trial(self._activity) is not None:
+            return Refused("a trial is under way")
         if self._activity is None:
             self._beat(torque=True)  # the watchdog watches from before it is on
             trip = self._body.enable(senses)
@@ -286,7 +294,8 @@ class Motion(threading.Thread):
         else:
             self._body.full_power()
         self._reason = ""
-        self._become(Hold(self._body.goal))
+        pose = self._body.limiter.within(self._body.goal)
+        self._become(Ramp(self._body.goal, pose, self._settings.ramp, Hold(pose)))
         return None
 
     def _disable(self, senses: Senses) -> Refused | None:
@@ -341,7 +350,8 @@ class Motion(threading.Thread):
 
     def _beat(self, torque: bool = False) -> None:
         if self._watchdog is not None:
-            self._watchdog.beat(torque or self._body.torque)
+            doubted = self._bus and self._body.doubted
+            self._watchdog.beat(torque or self._body.torque or doubted)
 
     def _told(self, senses: Senses | None) -> MotionStatus:
         return MotionStatus(
@@ -355,6 +365,7 @@ class Motion(threading.Thread):
             lost=self._body.lost,
             limited=self._limited,
             heat=self._body.guard.heat,
+            doubted=self._body.long_doubted,
         )
 
     def _realtime(self) -> None:

@@ -4,6 +4,7 @@ What the policy sees is what it saw in training (paper, section VI-A): the joint
 roll and pitch, now and a tick ago.
 """
 
+import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ IMU_COLUMNS = (
     *("imu/roll", "imu/pitch", "imu/yaw"),
     *(f"imu/{kind}_{axis}" for kind in ("gyro", "accel") for axis in "xyz"),
 )
+LONGEST = 120
+"""Characters of a recording's id."""
 DETAILS = ("velocity", "load", "temperature")
 
 
@@ -121,7 +124,10 @@ def columns(joints: Sequence[str], names: Sequence[str]) -> NDArray[np.intp]:
 def recording_id(assign: Assign) -> str:
     """The id of a trial's recording; the same whenever it is asked for."""
     told = f"{assign.study}_{assign.trial}_{assign.attempt}"
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", told).lstrip(".")[:120]
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "-", told).lstrip(".")
+    if plain == told and len(told) <= LONGEST:
+        return told
+    return f"{plain[: LONGEST - 17]}-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
 
 
 def recording_of(

@@ -6,6 +6,9 @@ from hardware_agent.metronome import Timing
 from hardware_agent.senses import Senses
 from pup.wire import AgentState
 
+LONGEST = 300
+"""Characters of a reason."""
+
 
 @dataclass(frozen=True)
 class MotionStatus:
@@ -22,6 +25,7 @@ class MotionStatus:
       lost: answers that did not come in spite of it.
       limited: what held the latest target back, by joint.
       heat: of the hottest winding (I²t), as a share of what is allowed.
+      doubted: joints whose servos have long not told that their torque is off, though it should be.
     """
 
     state: AgentState
@@ -34,6 +38,13 @@ class MotionStatus:
     lost: int
     limited: dict[str, str]
     heat: float
+    doubted: tuple[str, ...] = ()
+
+
+def brief(text: str) -> str:
+    """A text that fits into every message and journal: one line, not too long, sound Unicode."""
+    told = " ".join(text.encode("utf-8", "replace").decode("utf-8").split())
+    return told if len(told) <= LONGEST else f"{told[: LONGEST - 1]}…"
 
 
 @dataclass(frozen=True)

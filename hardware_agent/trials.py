@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import Any
 
 from hardware_agent.journal import Journal
+from hardware_agent.status import brief
 from pup.wire import (
     Accepted,
     Acknowledge,
@@ -101,12 +102,14 @@ class TrialBook:
         for key, trial in list(self._trials.items()):
             if trial.running and trial.finished is None:
                 self._finish(key, End(Outcome.ABORTED, RESTARTED))
+            elif trial.assign is None and trial.finished is None:
+                self._finish(key, End(Outcome.ABORTED, "cancelled"))
 
     @property
     def current(self) -> Assign | None:
         """The trial to run or being run."""
         for trial in self._trials.values():
-            if trial.finished is None:
+            if trial.finished is None and trial.assign is not None:
                 return trial.assign
         return None
 
@@ -231,7 +234,7 @@ class TrialBook:
             end.outcome,
             end.distance,
             end.time,
-            end.reason,
+            brief(end.reason),
             end.recording,
             end.digest,
         )

@@ -123,7 +123,7 @@ def test_the_bus_speaks_both_protocols(tmp_path: Path, mode: BusSettings) -> Non
 def test_trials_run_on_board_are_told_and_recorded(
     tmp_path: Path, check_contract: Callable[[Path], None]
 ) -> None:
-    """Lock-step, where a trial is the same each time; the link is cut while the robot walks."""
+    """Lock-step, where a trial is the same each time."""
     policy = bundle(tmp_path / "policies" / "still")
     with at_work(tmp_path) as (made, gateway):
         assert [p.sha256 for p in gateway.of(Hello)[0].policies] == [digest_of(policy)]

@@ -229,6 +229,15 @@ def test_a_pose_beyond_the_range_is_come_back_from_at_the_speed_limit() -> None:
     assert applied.goal == pytest.approx(np.full(3, 1.5 - LIMITS.speed * PERIOD))
 
 
+def test_a_pose_beyond_the_range_may_stay_and_goes_no_further() -> None:
+    limiter = Limiter(NAMES, LOWER, UPPER, LIMITS)
+    outside = np.full(3, 1.5)
+    for target in (outside, outside + 0.2):
+        applied = limiter.apply(target, outside, PERIOD)
+        assert isinstance(applied, Applied) and applied.goal == pytest.approx(outside)
+    assert limiter.within(outside) == pytest.approx(np.ones(3))
+
+
 @given(st.integers(0, 4095))
 def test_ticks_and_angles_are_each_others_inverse(tick: int) -> None:
     assert ticks(angle(tick)) == tick

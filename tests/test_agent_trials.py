@@ -292,8 +292,15 @@ def test_a_journal_survives_being_cut_off_anywhere(cut: int) -> None:
         trials.begin(assign())
         trials.finish(assign(), End(Outcome.SUCCEEDED, "fell", 0.4, 2.0))
         data = (path / "journal").read_bytes()
-        (path / "journal").write_bytes(data[: max(1, len(data) - cut)])
+        left = data[: max(1, len(data) - cut)]
+        (path / "journal").write_bytes(left)
         again = book(path)
+        told = left.count(b"\n") - 1  # after the line that tells the schema: taken on, begun, ended
+        ends = {f.state for f in again.owed}
+        assert len(again.entries()) == (told >= 1)
+        assert ends == (
+            {Outcome.SUCCEEDED} if told >= 3 else {Outcome.ABORTED} if told == 2 else set()
+        )
         again.assigned(assign("next"))
         assert book(path).entries() == again.entries()
 

@@ -37,6 +37,9 @@ DOUBTED = 4
 """Walks from which on simulated landscapes must explain them better than none do."""
 SPREAD_FLOOR = 1e-3
 """Least deviation of distances that they are scaled by, m."""
+LENGTHS = {False: (0.4, 0.9), True: (0.0, 0.7)}
+"""Mean and deviation of the logarithm of the kernel's lengths, by whether there is a prior: without
+one it may have to tell of all the box from a slope in a corner of it."""
 SMOOTH = 0.35
 """Length of the kernel that joins simulated etas, on the unit cube."""
 
@@ -269,15 +272,13 @@ def _model(told: Told, prior: Landscapes | None, centre: float, scale: float) ->
         MaternKernel(
             nu=2.5,
             ard_num_dims=told.eta.shape[1],
-            lengthscale_prior=LogNormalPrior(0.0, 0.7),
+            lengthscale_prior=LogNormalPrior(*LENGTHS[prior is not None]),
             lengthscale_constraint=GreaterThan(0.025),
         ),
-        outputscale_prior=GammaPrior(2.0, 6.0),
+        outputscale_prior=LogNormalPrior(0.0, 1.0) if prior is None else GammaPrior(2.0, 6.0),
     )
     matern.base_kernel.lengthscale = 1.0
     matern.outputscale = 1.0 if prior is None else 0.3
-    # Distances were scaled by their own deviation; how far a robot is off its prior is not known.
-    matern.raw_outputscale.requires_grad_(prior is not None)
     likelihood = GaussianLikelihood(
         noise_prior=LogNormalPrior(-3.0, 1.0), noise_constraint=GreaterThan(1e-4)
     )

@@ -1,0 +1,115 @@
+"""What an agent must not do: come to life late, leave a servo holding, end for a typo."""
+
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from agents import Lab, bundle, lab, standing, wait
+from test_agent import assign, at_work
+
+from hardware_agent.request import Request
+from hardware_agent.rollout import recording_id
+from hardware_agent.senses import Senses
+from hardware_agent.status import LONGEST, Refused, brief
+from pup.errors import InputError
+from pup.wire import Assign, Finished, Outcome, Running
+
+pytest.importorskip("mujoco")
+
+
+def holding(made: Lab) -> int:
+    return int(made.side(cmd="bus")["holding"])
+
+
+def enabled(made: Lab) -> None:
+    def tried() -> bool:
+        try:
+            made.say("enable")
+        except InputError:  # a servo's answer may come late on a busy machine
+            return False
+        return True
+
+    wait(tried, 20, made.log)
+
+
+def test_an_enable_that_was_refused_is_not_done_later(tmp_path: Path) -> None:
+    """The port is gone, `enable` is refused, somebody presses stop; then the port comes back."""
+    with lab(tmp_path) as made:
+        made.start()
+        made.side(cmd="fault", kind="port_pulled")
+        wait(lambda: not made.health()["bus"]["works"], 20, made.log)
+        with pytest.raises(InputError, match="the control loop does not run"):
+            made.say("enable")
+        made.say("stop")
+        made.side(cmd="fault", kind="port_pulled", off=True)
+        wait(lambda: made.health()["bus"]["works"], 20, made.log)
+        time.sleep(0.5)
+        assert made.health()["state"] != "enabled"
+        assert holding(made) == 0
+
+
+def test_servos_whose_cable_was_out_are_made_limp_when_it_is_back(tmp_path: Path) -> None:
+    with lab(tmp_path) as made:
+        made.start()
+        enabled(made)
+        made.side(cmd="fault", kind="bus_pulled")
+        made.until("fault")
+        assert holding(made) == 20, "they have not heard of it"
+        wait(lambda: "not known to be limp" in str(made.health()["problems"]), 10, made.log)
+        made.side(cmd="fault", kind="bus_pulled", off=True)
+        wait(lambda: holding(made) == 0, 10, made.log)
+        made.say("disable")
+        wait(lambda: made.health()["problems"] == [], 10, lambda: str(made.health()))
+
+
+def test_whoever_enables_a_robot_that_walks_is_refused_and_it_walks_on(tmp_path: Path) -> None:
+    policy = bundle(tmp_path / "policies" / "still", standing())
+    with at_work(tmp_path, speed=1.0) as (made, gateway):
+        gateway.send(assign(policy, "a", horizon=2.0))
+        gateway.wait(Running, told=made.log)
+        with pytest.raises(InputError, match="a trial is under way"):
+            made.say("enable")
+        assert gateway.wait(Finished, told=made.log).state is Outcome.SUCCEEDED
+
+
+def test_nonsense_of_this_computer_does_not_end_the_agent(tmp_path: Path) -> None:
+    with lab(tmp_path) as made:
+        made.start()
+        for distance in ("abc", [], None, True, {}):
+            with pytest.raises(InputError, match="no number"):
+                made.say("distance", distance=distance)
+        with pytest.raises(InputError, match="no trial waits"):
+            made.say("arm")
+        made.say("stop", reason="x" * 20_000 + "\ud800")
+        wait(lambda: made.health()["state"] == "stopped", 10, made.log)
+        assert len(made.health()["reason"]) < 2 * LONGEST
+        assert isinstance(made.agent, subprocess.Popen) and made.agent.poll() is None
+
+
+def test_what_nobody_waits_for_any_more_is_not_done() -> None:
+    done: list[Senses] = []
+    request = Request(lambda senses: done.append(senses))
+    assert request.wait(0.01, Refused("late")) == Refused("late")
+    request.run(None)  # type: ignore[arg-type]
+    assert done == []
+    stopped = Request(lambda senses: done.append(senses))
+    stopped.refuse(Refused("stop"))
+    assert stopped.wait(1.0, Refused("late")) == Refused("stop") and done == []
+
+
+def test_recordings_of_long_names_have_ids_of_their_own() -> None:
+    def name(study: str, trial: str) -> str:
+        return recording_id(Assign(study, trial, 1, 1, "0" * 64, (0.0,), 1.0))
+
+    assert name("s", "s-1") == "s_s-1_1"
+    names = {name("s" * 63, f"{'s' * 63}-{i}") for i in range(50)} | {
+        name("a b", "c"),
+        name("a-b", "c"),
+    }
+    assert len(names) == 52 and max(map(len, names)) <= 120
+
+
+def test_a_reason_is_one_line_that_fits_everywhere() -> None:
+    assert brief(" two\nlines ") == "two lines"
+    assert len(brief("x" * 10_000)) == LONGEST and brief("\ud800").encode()
