@@ -31,6 +31,7 @@ from pup.wire import (
     Assign,
     Body,
     Cancel,
+    Finished,
     Outcome,
     RecordingChunk,
     Sample,
@@ -171,6 +172,20 @@ class Conductor:
         if self._future is not None and self._future.done():
             self._collect(self._future)
 
+    def told(self, finished: Finished) -> list[Body]:
+        """How a trial ended, as the gateway is told: its recording in pieces, then the end."""
+        recording = finished.recording
+        if recording is None or not self._settings.link.upload:
+            return [finished]
+        try:
+            data = self._file(recording).read_bytes()
+        except OSError as error:  # moved away by hand, say; the walk counts all the same
+            log.warning("recording %s cannot be sent: %s", recording, error)
+            return [finished]
+        pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
+        chunks = (RecordingChunk(recording, n, len(pieces), p) for n, p in enumerate(pieces))
+        return [*chunks, finished]
+
     def close(self) -> None:
         """Leave it to the next start."""
         self._hands.shutdown(wait=False, cancel_futures=True)
@@ -300,9 +315,7 @@ class Conductor:
         walked = self._ended.time if self._ended else None
         end = End(outcome, reason, distance, walked, recording, digest)
         finished = self._book.finish(self._assign, end)
-        if recording is not None and self._settings.link.upload:
-            self._send(*self._chunks(recording))
-        self._send(finished)
+        self._send(*self.told(finished))
         self._reset()
         self._motion.measured()
 
@@ -310,14 +323,6 @@ class Conductor:
         self.stage, self.waiting = Stage.NONE, ""
         self._assign = self._rollout = self._ended = self._recording = self._future = None
         self._armed = False
-
-    def _chunks(self, recording: str) -> list[Body]:
-        data = self._file(recording).read_bytes()
-        pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
-        return [
-            RecordingChunk(recording, number, len(pieces), piece)
-            for number, piece in enumerate(pieces)
-        ]
 
     def _file(self, recording: str) -> Path:
         return self._settings.state / "recordings" / f"{recording}.parquet"

@@ -264,7 +264,7 @@ class Agent:
             self._send(Heartbeat(self._settings.name, state, told, self._conductor.trial))
         if now - self._resent >= RESEND:
             self._resent = now
-            self._send(*self._book.owed)
+            self._send(*self._owed())
 
     def _hello(self) -> list[Body]:
         hello = Hello(
@@ -274,7 +274,11 @@ class Agent:
             self._shelf.policies(),
             self._book.entries(),
         )
-        return [hello, *self._book.owed]
+        return [hello, *self._owed()]
+
+    def _owed(self) -> list[Body]:
+        """What the gateway has not acknowledged; with recordings, which may have been cut off."""
+        return [body for end in self._book.owed for body in self._conductor.told(end)]
 
     def _send(self, *bodies: Body) -> None:
         if self._link is not None:

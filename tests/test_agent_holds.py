@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from agents import Lab, bundle, lab, standing, wait
+from far_end import Gateway
 from test_agent import assign, at_work
 
 from hardware_agent.request import Request
@@ -13,7 +14,7 @@ from hardware_agent.rollout import recording_id
 from hardware_agent.senses import Senses
 from hardware_agent.status import LONGEST, Refused, brief
 from pup.errors import InputError
-from pup.wire import Assign, Finished, Outcome, Running
+from pup.wire import Assign, Finished, Outcome, RecordingChunk, Running
 
 pytest.importorskip("mujoco")
 
@@ -71,6 +72,26 @@ def test_whoever_enables_a_robot_that_walks_is_refused_and_it_walks_on(tmp_path:
         with pytest.raises(InputError, match="a trial is under way"):
             made.say("enable")
         assert gateway.wait(Finished, told=made.log).state is Outcome.SUCCEEDED
+
+
+def test_a_walk_goes_on_without_its_link_and_is_told_whole_when_that_is_back(
+    tmp_path: Path,
+) -> None:
+    policy = bundle(tmp_path / "policies" / "still", standing())
+    with at_work(tmp_path, speed=1.0) as (made, gateway):
+        gateway.send(assign(policy, "a", horizon=2.0))
+        gateway.wait(Running, told=made.log)
+        gateway.close()
+        wait(lambda: not made.health()["trial"], 30, made.log)
+        assert made.health()["state"] == "enabled", "it stands"
+        back = Gateway(gateway.folder, port=gateway.port)
+        wait(lambda: bool(back.of(Finished)), 30, made.log)
+        ended = back.of(Finished)[0]
+        assert (ended.state, ended.reason) == (Outcome.SUCCEEDED, "reached the horizon")
+        data = (tmp_path / "state" / "recordings" / f"{ended.recording}.parquet").read_bytes()
+        chunks = {c.number: c.data for c in back.of(RecordingChunk)}
+        assert b"".join(chunks[n] for n in sorted(chunks)) == data
+        back.close()
 
 
 def test_nonsense_of_this_computer_does_not_end_the_agent(tmp_path: Path) -> None:
