@@ -159,7 +159,8 @@ class Body:
             return Trip("enable", f"the pose is not known: {silent} does not answer")
         self.guard.reset()
         self.goal, self._written = senses.position.copy(), senses.time
-        deaf = self.bus.prepare(self.goal, self.settings.safety.late)
+        self.bus.prepare(self.goal, self.settings.safety.late)
+        deaf = self.bus.without(self.goal)
         if deaf:
             told = ", ".join(self.names[self.ids.index(number)] for number in deaf[:3])
             return Trip("enable", f"{told} did not take its goal")

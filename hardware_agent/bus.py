@@ -156,15 +156,12 @@ class Bus:
         for _ in range(WRITES):
             self._all(self.registers.torque_enable, int(on))
 
-    def prepare(self, goals: Sequence[float] | Array, deadline: float) -> list[int]:
+    def prepare(self, goals: Sequence[float] | Array, deadline: float) -> None:
         """Set limp servos up such that they stay where they are when torque comes.
 
         Args:
           goals: where they are, rad.
           deadline: s without an instruction after which servos that can stop by themselves.
-
-        Returns:
-          Servos that have another goal all the same, or do not say.
         """
         own = self.registers
         for span, value in zip(own.gains, self.settings.gains or own.paper, strict=True):
@@ -175,9 +172,16 @@ class Bus:
             self._all(own.bus_watchdog, 0)  # one that has bitten refuses goals until told so
             self._all(own.bus_watchdog, min(127, math.ceil(deadline / 0.02)))
         self.write(goals)
+
+    def without(self, goals: Sequence[float] | Array) -> list[int]:
+        """Servos that have other goals than these, or do not say which."""
         wanted = {name: ticks(goal) for name, goal in zip(self.ids, goals, strict=True)}
         with self._told():
-            return [name for name, goal in wanted.items() if self._register(name, own.goal) != goal]
+            return [
+                name
+                for name, goal in wanted.items()
+                if self._register(name, self.registers.goal) != goal
+            ]
 
     def soften(self, share: float) -> None:
         """Limit the servos' power to a share of what they have."""

@@ -209,7 +209,8 @@ class Player:
             self._say(cmd="period", time=gap)
             self._gap = gap
         trip = self.body.guard.check(senses)
-        applied = self.body.command(target, self._time) if trip is None else trip
+        within = self.body.limiter.within(target)  # also where it hangs beyond its ranges
+        applied = self.body.command(within, self._time) if trip is None else trip
         if isinstance(applied, Trip):
             self.body.limp()
             raise InputError(f"recording {name}: stopped by {applied}")
