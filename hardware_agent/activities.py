@@ -15,6 +15,7 @@ from pup.wire import AgentState, Assign, Outcome
 Array = NDArray[np.float64]
 
 RETURN = 0.5  # s from where a walk's end left the joints to the pose that stands
+WATCHED = 2.0  # s after that in which it may still fall; then people take it
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +75,14 @@ class Activity(Protocol):
 
     Attributes:
       state: what the gateway is told.
+      alone: whether the robot is on its own feet, so that a large tilt is a fall.
     """
 
     state: AgentState
+
+    @property
+    def alone(self) -> bool:
+        """See above."""
 
     def step(self, senses: Senses) -> "tuple[Array, Activity]":
         """The target of this tick, rad, and what to do in the next."""
@@ -88,6 +94,7 @@ class Hold:
 
     pose: Array
     state: AgentState = AgentState.ENABLED
+    alone: bool = False
 
     def step(self, senses: Senses) -> tuple[Array, Activity]:
         """See Activity."""
@@ -99,6 +106,7 @@ class Lie:
     """Yield to whoever lifts the robot: the target is where the joints are."""
 
     state: AgentState = AgentState.ENABLED
+    alone: bool = False
 
     def step(self, senses: Senses) -> tuple[Array, Activity]:
         """See Activity."""
@@ -115,6 +123,7 @@ class Ramp:
       duration: s.
       then: what comes after.
       state: meanwhile.
+      alone: meanwhile.
     """
 
     begin: Array
@@ -122,6 +131,7 @@ class Ramp:
     duration: float
     then: Activity
     state: AgentState = AgentState.ENABLED
+    alone: bool = False
     start: float | None = None
 
     def step(self, senses: Senses) -> tuple[Array, Activity]:
@@ -159,6 +169,11 @@ class Settle:
     begun: float | None = None
     since: float | None = None
     told: bool = False
+
+    @property
+    def alone(self) -> bool:
+        """Once it stands ready nobody holds it."""
+        return self.told
 
     def step(self, senses: Senses) -> tuple[Array, Activity]:
         """See Activity."""
@@ -198,6 +213,7 @@ class Walk:
     emit: Emit
     cancelled: bool = False
     state: AgentState = AgentState.RUNNING
+    alone: bool = True
 
     def step(self, senses: Senses) -> tuple[Array, Activity]:
         """See Activity."""
@@ -214,4 +230,5 @@ class Walk:
         time = self.rollout.time(senses.time)
         self.emit(Ended(self.assign, outcome, reason, self.rollout, time))
         pose = self.rollout.pose
-        return Ramp(senses.goal, pose, RETURN, Hold(pose)).step(senses)
+        stand = Ramp(pose, pose, WATCHED, Hold(pose), alone=True)
+        return Ramp(senses.goal, pose, RETURN, stand, alone=True).step(senses)

@@ -91,12 +91,13 @@ class Body:
         if self.imu is not None:
             self.imu.close()
 
-    def sense(self, now: float, walking: bool) -> Senses:
+    def sense(self, now: float, walking: bool, alone: bool) -> Senses:
         """Ask all sensors.
 
         Args:
           now: of the tick, s.
           walking: whether a rollout is under way.
+          alone: whether the robot is on its own feet.
 
         Raises:
           BusError: the bus or the IMU is gone.
@@ -124,6 +125,7 @@ class Body:
             goal=self.goal,
             written=self._written,
             walking=walking,
+            alone=alone,
         )
 
     def _take(self, answers: Answers, now: float) -> dict[str, str]:

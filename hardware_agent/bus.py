@@ -16,6 +16,7 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from numpy.typing import NDArray
 
 from hardware_agent.config import BusSettings
+from hardware_agent.plausible import Plausible
 from hardware_agent.port import FAILURES, BusError, Port, device_error
 from hardware_agent.registers import (
     BOARD_POWER,
@@ -70,6 +71,7 @@ class Bus:
         self._senses = senses
         self._port = Port(settings.port, settings.baud, settings.timeout)
         self._packets = PacketHandler(float(settings.protocol))
+        self._plausible = Plausible()
         self._turn = 0
 
     def open(self) -> list[str]:
@@ -127,7 +129,10 @@ class Bus:
         self._port.close()
 
     def read(self) -> Answers:
-        """Ask every servo; who does not answer is asked again, as often as the settings say."""
+        """Ask every servo; who does not answer, or what cannot be, is asked again.
+
+        As often as the settings say; see Plausible.
+        """
         detailed = self._detailed()
         found: dict[int, Status] = {}
         board: dict[int, bytes] = {}
@@ -267,8 +272,10 @@ class Bus:
             wanted.discard(name)
             if name == self.settings.board:
                 board[name] = data
-            else:
-                found[name] = self.registers.status(data, packet[at], name in detailed)
+                continue
+            status = self.registers.status(data, packet[at], name in detailed)
+            if self._plausible.believes(name, status.position, time.monotonic()):
+                found[name] = status
 
     def _all(self, span: Span, value: int) -> None:
         self._send(span, dict.fromkeys(self.ids, value))

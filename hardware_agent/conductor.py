@@ -4,12 +4,10 @@ accepted → (enabled, cool, and let start by whoever stands there) armed → st
 feet → settled → written down as running → walking → ended → distance → finished.
 """
 
-import logging
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,13 +17,12 @@ from hardware_agent.config import Settings
 from hardware_agent.distance import Distance, DistanceError
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
-from hardware_agent.rollout import Rollout, recording_of
+from hardware_agent.recordings import Kept, Recordings
+from hardware_agent.rollout import Rollout
 from hardware_agent.trials import End, TrialBook
 from pup.errors import InputError
-from pup.files import sha256
 from pup.robot import RobotDescription
 from pup.wire import (
-    CHUNK,
     AgentState,
     Armed,
     Assign,
@@ -33,11 +30,8 @@ from pup.wire import (
     Cancel,
     Finished,
     Outcome,
-    RecordingChunk,
     Sample,
 )
-
-log = logging.getLogger("pup-agent")
 
 SAMPLES = 0.2  # s between two samples
 LONGEST = 600.0  # s, of a walk
@@ -66,6 +60,7 @@ class Conductor:
       motion: the control loop.
       shelf: of policies.
       distance: who measures.
+      recordings: of walks.
       send: to the gateway.
     """
 
@@ -77,11 +72,12 @@ class Conductor:
         motion: Motion,
         shelf: Shelf,
         distance: Distance,
+        recordings: Recordings,
         send: Callable[..., None],
     ) -> None:
         self._settings, self._robot = settings, robot
         self._book, self._motion, self._shelf = book, motion, shelf
-        self._distance, self._send = distance, send
+        self._distance, self._recordings, self._send = distance, recordings, send
         self._hands = ThreadPoolExecutor(1, "distance")  # for what takes its time
         self.stage = Stage.NONE
         self.waiting = ""
@@ -91,7 +87,7 @@ class Conductor:
         self._armed = False
         self._future: Future[Any] | None = None
         self._ended: Ended | None = None
-        self._recording: tuple[str, str] | None = None
+        self._recording: Kept | None = None
         self._sampled = 0.0
 
     @property
@@ -140,9 +136,7 @@ class Conductor:
         """The gateway takes a trial back."""
         answers, end = self._book.cancelled(cancel)
         self._send(*answers)
-        told = bool(answers) or end  # an older fence's is not heard
-        mine = told and self._assign is not None and _key(cancel) == _key(self._assign)
-        if mine and (end or self.stage in (Stage.POSING, Stage.PLACING, Stage.SETTLING)):
+        if end and self._assign is not None and _key(cancel) == _key(self._assign):
             self._motion.cancel("cancelled")
 
     def handle(self, event: Event) -> None:
@@ -168,23 +162,16 @@ class Conductor:
             self._take(current)
         if self.stage is Stage.WAITING:
             self._start()
+        if self.stage in (Stage.POSING, Stage.PLACING, Stage.SETTLING) and not self._mine(current):
+            self._motion.cancel("taken back")
         self._motion.hurry(self.stage is Stage.WAITING and self.waiting == COOL)
         if self._future is not None and self._future.done():
             self._collect(self._future)
 
     def told(self, finished: Finished) -> list[Body]:
         """How a trial ended, as the gateway is told: its recording in pieces, then the end."""
-        recording = finished.recording
-        if recording is None or not self._settings.link.upload:
-            return [finished]
-        try:
-            data = self._file(recording).read_bytes()
-        except OSError as error:  # moved away by hand, say; the walk counts all the same
-            log.warning("recording %s cannot be sent: %s", recording, error)
-            return [finished]
-        pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
-        chunks = (RecordingChunk(recording, n, len(pieces), p) for n, p in enumerate(pieces))
-        return [*chunks, finished]
+        upload = self._settings.link.upload
+        return [*(self._recordings.pieces(finished) if upload else ()), finished]
 
     def close(self) -> None:
         """Leave it to the next start."""
@@ -246,15 +233,17 @@ class Conductor:
 
     def _begin(self) -> None:
         assert self._assign is not None
-        current = self._book.current
-        if current is None or _key(current) != _key(self._assign):
-            self._motion.cancel("cancelled")
+        if not self._mine(self._book.current):
+            self._motion.cancel("taken back")
             return
         self._send(self._book.begin(self._assign))
+        self._recordings.flight.begin(self._assign)
         self.stage = Stage.RUNNING
         self._motion.go(self._assign)
 
     def _sample(self, event: Walked) -> None:
+        if self._rollout is not None:
+            self._recordings.flight.keep(self._rollout.rows)
         if time.monotonic() - self._sampled < SAMPLES:
             return
         self._sampled = time.monotonic()
@@ -274,7 +263,8 @@ class Conductor:
                 self.waiting = "distance"
             else:
                 self._future = self._hands.submit(self._distance.end)
-        self._recording = self._record(event)
+        rows = np.array([row.values for row in event.rollout.rows])
+        self._recording = self._recordings.keep(event.assign, rows, event.reason)
         if event.outcome is not Outcome.SUCCEEDED:
             self._finish(event.outcome, event.reason)
 
@@ -294,21 +284,6 @@ class Conductor:
         elif self.stage is Stage.MEASURING:
             self._finish(Outcome.SUCCEEDED, self._reason, told)
 
-    def _record(self, event: Ended) -> tuple[str, str] | None:
-        """Write the recording, if there was motion; returns its id and its file's digest."""
-        if len(event.rollout.rows) < 2:
-            return None
-        control = self._settings.control
-        notes = f"eta {list(event.assign.eta)}; policy {event.assign.policy}; {event.reason}"
-        made = recording_of(event.assign, event.rollout, self._robot.name, control.source, notes)
-        file = self._file(made.id)
-        try:
-            made.write(file)
-            return made.id, sha256(file)
-        except OSError as error:  # the walk counts all the same
-            log.error("recording %s is lost: %s", made.id, error)
-            return None
-
     def _finish(self, outcome: Outcome, reason: str, distance: float | None = None) -> None:
         assert self._assign is not None
         recording, digest = self._recording or (None, None)
@@ -324,8 +299,10 @@ class Conductor:
         self._assign = self._rollout = self._ended = self._recording = self._future = None
         self._armed = False
 
-    def _file(self, recording: str) -> Path:
-        return self._settings.state / "recordings" / f"{recording}.parquet"
+    def _mine(self, current: Assign | None) -> bool:
+        """Whether the book's trial is still the one at work here."""
+        both = current is not None and self._assign is not None
+        return both and _key(current) == _key(self._assign)
 
     def _fence(self) -> int:
         assert self._assign is not None

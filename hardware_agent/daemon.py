@@ -29,9 +29,11 @@ from hardware_agent.link import Link
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.port import BusError, BusyError
+from hardware_agent.recordings import Recordings
 from hardware_agent.status import brief
 from hardware_agent.systemd import notify
 from hardware_agent.trials import TrialBook
+from hardware_agent.warmth import Warmth
 from hardware_agent.watchdog import Watchdog
 from pup.errors import InputError
 from pup.robot import RobotDescription
@@ -69,7 +71,10 @@ class Agent:
         self._settings = settings
         self._robot = RobotDescription.load(settings.robot)
         self._body = RobotBody(settings, self._robot)
-        self._book = TrialBook(Journal(settings.state / "journal"))
+        self._recordings = Recordings(settings.state, self._robot, settings.control.source)
+        self._book = TrialBook(Journal(settings.state / "journal"), self._recordings.salvage)
+        self._warmth = Warmth(settings.state / "warmth", settings.safety.current_time)
+        self._body.guard.warm(self._warmth.left())
         self._shelf = Shelf(settings.policies, self._robot)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
@@ -97,6 +102,7 @@ class Agent:
             self._motion,
             self._shelf,
             distance_of(self._settings.distance),
+            self._recordings,
             self._send,
         )
         self._motion.start()
@@ -249,6 +255,7 @@ class Agent:
 
     def _beat(self) -> None:
         now = time.monotonic()
+        self._warmth.keep(self._motion.status.heat)
         state = self._motion.status.state
         changed, self._seen = state is not self._seen, state
         if changed:

@@ -155,11 +155,13 @@ class Motion(threading.Thread):
             self._tell()
             return
         try:
-            walking = isinstance(self._activity, Walk)
-            senses = self._body.sense(now, walking)
+            doing = self._activity
+            alone = doing is not None and doing.alone
+            senses = self._body.sense(now, isinstance(doing, Walk), alone)
             if self._body.torque:
                 self._move(senses)
             else:
+                self._body.guard.rest(senses)
                 self._body.confirm_limp(senses)
             self._serve(senses)
         except BusError as error:

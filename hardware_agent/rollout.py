@@ -8,7 +8,6 @@ import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,8 @@ IMU_COLUMNS = (
 )
 LONGEST = 120
 """Characters of a recording's id."""
-DETAILS = ("velocity", "load", "temperature")
+KINDS = ("target", "position", "velocity", "load", "temperature")
+"""Of a row, for every joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,14 @@ class Row:
     senses: Senses
     applied: Applied
     torque: bool = True
+
+    @property
+    def values(self) -> Array:
+        """Its numbers; see `row_names`."""
+        own = self.senses
+        per_joint = [self.applied.goal, _fresh(own), own.velocity, own.load, own.temperature]
+        rest = [[own.supply], _inertial(own), [float(self.torque)]]
+        return np.concatenate([[self.time], *per_joint, *rest])
 
 
 class Rollout:
@@ -130,60 +138,52 @@ def recording_id(assign: Assign) -> str:
     return f"{plain[: LONGEST - 17]}-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
 
 
+def row_names(joints: Sequence[str]) -> tuple[str, ...]:
+    """What the numbers of a row are, as CONTRACTS.md names columns."""
+    per_joint = [f"{kind}/{joint}" for kind in KINDS for joint in joints]
+    return ("time", *per_joint, "voltage", *IMU_COLUMNS, "torque_enabled")
+
+
 def recording_of(
-    assign: Assign, rollout: Rollout, robot: str, source: str, notes: str
+    assign: Assign, rows: Array, joints: Sequence[str], robot: str, source: str, notes: str
 ) -> Recording:
     """What a rollout did, by CONTRACTS.md.
 
     Args:
       assign: the trial.
-      rollout: at its end, with two rows at least.
+      rows: of its ticks, two at least, shape (n_ticks, n_columns); see `row_names`.
+      joints: their names.
       robot: its name.
       source: `hardware` or `simulation`.
       notes: free text.
     """
-    rows = rollout.rows
+    n = len(joints)
+    table = dict(zip(row_names(joints), rows.T, strict=True))
+    main = {"time", *(f"{kind}/{joint}" for kind in KINDS[:2] for joint in joints)}
+    extras = {k: v for k, v in table.items() if k not in main and not np.isnan(v).all()}
     return Recording(
         id=recording_id(assign),
         robot=robot,
         motion="walk",
         support="ground",
         source=source,
-        **columns_of(rows),
+        joints=tuple(joints),
+        time=rows[:, 0],
+        target=rows[:, 1 : 1 + n],
+        position=rows[:, 1 + n : 1 + 2 * n],
+        extras=extras,
         repeat_of=assign.repeat_of,
         notes=notes,
     )
 
 
-def columns_of(rows: Sequence[Row]) -> dict[str, Any]:
-    """What rows say of joints, time, targets, positions and the rest, as a Recording takes it."""
-    names = rows[0].senses.names
-    extras: dict[str, Array] = {}
-    for kind in DETAILS:
-        values = np.array([getattr(row.senses, kind) for row in rows])
-        extras |= {f"{kind}/{name}": values[:, j] for j, name in enumerate(names)}
-    extras["voltage"] = np.array([row.senses.supply for row in rows])
-    if rows[0].senses.has_imu:
-        told = np.array([_inertial(row) for row in rows])
-        extras |= {name: told[:, j] for j, name in enumerate(IMU_COLUMNS)}
-    extras["torque_enabled"] = np.array([float(row.torque) for row in rows])
-    return {
-        "joints": names,
-        "time": np.array([row.time for row in rows]),
-        "target": np.array([row.applied.goal for row in rows]),
-        "position": np.array([_fresh(row) for row in rows]),
-        "extras": {name: v for name, v in extras.items() if not np.isnan(v).all()},
-    }
-
-
-def _fresh(row: Row) -> Array:
+def _fresh(senses: Senses) -> Array:
     """Positions of the tick itself; a reading of an earlier one is missing in this one."""
-    senses = row.senses
     return np.where(senses.seen == senses.time, senses.position, np.nan)
 
 
-def _inertial(row: Row) -> Array:
-    imu = row.senses.imu
-    if imu is None or row.senses.imu_seen != row.senses.time:
+def _inertial(senses: Senses) -> Array:
+    imu = senses.imu
+    if imu is None or senses.imu_seen != senses.time:
         return np.full(len(IMU_COLUMNS), np.nan)
     return np.concatenate([[imu.roll, imu.pitch, imu.yaw], imu.gyro, imu.accel])

@@ -210,30 +210,34 @@ class Overload:
 
     def __init__(self, limits: SafetySettings) -> None:
         self._limits = limits
-        self._heat: Array | None = None
+        self._heat: Array = np.zeros(1)  # of each joint, once they are known
         self._last: Senses | None = None
-        self.reset()
 
     def reset(self) -> None:
-        """See Rule: a winding forgets nothing, but it cools while torque is off."""
-        self._on = False
+        """See Rule: a winding forgets nothing."""
 
     @property
     def heat(self) -> float:
         """The hottest winding's, as a share of what is allowed."""
-        return 0.0 if self._heat is None else float(self._heat.max()) / self._limits.current**2
+        return float(self._heat.max()) / self._limits.current**2
+
+    def warm(self, share: float) -> None:
+        """What an earlier agent knew of the heat, for all joints."""
+        self._heat = np.full(1, share * self._limits.current**2)
+
+    def rest(self, senses: Senses) -> None:
+        """A tick without torque: windings cool."""
+        last, self._last = self._last, senses
+        if last is not None:
+            step = max(senses.time - last.time, 0.0)
+            self._heat = self._heat * math.exp(-step / self._limits.current_time)
 
     def check(self, senses: Senses) -> str | None:
         """See Rule."""
         limits, last, self._last = self._limits, self._last, senses
-        if last is None or self._heat is None:
-            self._heat = np.zeros(len(senses.names))
+        if last is None:
             return None
         step = senses.time - last.time
-        if not self._on:
-            self._on = True
-            self._heat *= math.exp(-max(step, 0.0) / limits.current_time)
-            return None
         speed = (senses.position - last.position) / max(step, 1e-3)
         duty = np.clip(limits.duty_per_radian * (last.goal - senses.position), -1.0, 1.0)
         current = np.nan_to_num(duty - speed / limits.free_speed)
@@ -279,7 +283,10 @@ class ServoAlarm(_Stateless):
 
 
 class Fall:
-    """A walking robot that falls: tilted too far, or about to be by the gyroscope."""
+    """A robot on its own feet that falls: tilted too far, or about to be by the gyroscope.
+
+    While people handle it, it may lie as they like.
+    """
 
     name, response = "fall", Response.SOFT
 
@@ -292,7 +299,7 @@ class Fall:
     def check(self, senses: Senses) -> str | None:
         """See Rule."""
         imu = senses.imu
-        if imu is None or not senses.walking:
+        if imu is None or not senses.alone:
             return None
         for name, angle, rate in (
             ("roll", imu.roll, imu.gyro[0]),
@@ -314,7 +321,6 @@ RULES = (
     Voltage,
     OverTemperature,
     Heating,
-    Overload,
     StuckEncoder,
 )
 
@@ -328,7 +334,9 @@ class Guard:
     """
 
     def __init__(self, limits: SafetySettings, tilt: float) -> None:
-        self.rules: list[Rule] = [rule(limits) for rule in RULES] + [Fall(limits, tilt)]
+        self._overload = Overload(limits)
+        self.rules: list[Rule] = [rule(limits) for rule in RULES]
+        self.rules += [self._overload, Fall(limits, tilt)]
 
     def reset(self) -> None:
         """Torque comes on."""
@@ -338,7 +346,15 @@ class Guard:
     @property
     def heat(self) -> float:
         """Of the motors' windings (I²t), as a share of what is allowed."""
-        return max(rule.heat for rule in self.rules if isinstance(rule, Overload))
+        return self._overload.heat
+
+    def warm(self, share: float) -> None:
+        """Take over that heat from an earlier agent."""
+        self._overload.warm(share)
+
+    def rest(self, senses: Senses) -> None:
+        """A tick without torque."""
+        self._overload.rest(senses)
 
     def check(self, senses: Senses) -> Trip | None:
         """The first rule that is broken; every rule sees every tick."""

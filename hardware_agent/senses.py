@@ -63,6 +63,7 @@ class Senses:
       goal: written last, rad.
       written: when, s.
       walking: whether a rollout is under way.
+      alone: whether it is on its own feet: nobody lifts it or puts it down.
     """
 
     time: float
@@ -80,6 +81,7 @@ class Senses:
     goal: Array
     written: float
     walking: bool
+    alone: bool
 
     @property
     def supply(self) -> float:

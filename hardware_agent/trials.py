@@ -4,7 +4,7 @@ Messages come at least once, late and in any order; a trial's motion comes at mo
 decided here is in the journal before it is answered or acted upon.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -92,16 +92,18 @@ class TrialBook:
 
     Args:
       journal: where they stand.
+      salvage: how such a motion ended; it may have left a recording.
     """
 
-    def __init__(self, journal: Journal) -> None:
+    def __init__(self, journal: Journal, salvage: Callable[[Assign], "End"] | None = None) -> None:
         self._journal = journal
         self._trials: dict[Key, Trial] = {}
         for entry in journal.entries:
             self._replay(entry)
         for key, trial in list(self._trials.items()):
             if trial.running and trial.finished is None:
-                self._finish(key, End(Outcome.ABORTED, RESTARTED))
+                known = salvage and trial.assign and salvage(trial.assign)
+                self._finish(key, known or End(Outcome.ABORTED, RESTARTED))
             elif trial.assign is None and trial.finished is None:
                 self._finish(key, End(Outcome.ABORTED, "cancelled"))
 

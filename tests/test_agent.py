@@ -178,6 +178,7 @@ def test_a_cancelled_trial_stands_and_a_restart_never_repeats_a_motion(tmp_path:
         gateway.send(assign(policy, "b", horizon=30.0))
         gateway.wait(Running, told=made.log)
         before = len(gateway.of(Running))
+        wait(lambda: any(s.number > 20 for s in gateway.of(Sample)), 20, made.log)
         made.kill()
         wait(lambda: limp(made), 10)
         known = len(gateway.of(Hello))
@@ -188,6 +189,10 @@ def test_a_cancelled_trial_stands_and_a_restart_never_repeats_a_motion(tmp_path:
         ended = [f for f in gateway.of(Finished) if f.trial == "b"]
         assert {(f.state, f.reason) for f in ended} == {(Outcome.ABORTED, "agent restarted")}
         assert [e.trial for e in told.journal] == ["b"]
+        saved = Recording.read(tmp_path / "state" / "recordings" / f"{ended[0].recording}.parquet")
+        saved.validate(DARWIN)
+        assert len(saved.time) > 20 and saved.time[-1] == ended[0].time, "what it did so far"
+        assert any(c.recording == ended[0].recording for c in gateway.of(RecordingChunk))
         gateway.send(assign(policy, "b", horizon=30.0))
         time.sleep(1.0)
         assert len(gateway.of(Running)) == before

@@ -1,7 +1,9 @@
 """What an agent must not do: come to life late, leave a servo holding, end for a typo."""
 
+import json
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from hardware_agent.rollout import recording_id
 from hardware_agent.senses import Senses
 from hardware_agent.status import LONGEST, Refused, brief
 from pup.errors import InputError
-from pup.wire import Assign, Finished, Outcome, RecordingChunk, Running
+from pup.wire import Armed, Assign, Finished, Outcome, RecordingChunk, Running
 
 pytest.importorskip("mujoco")
 
@@ -92,6 +94,34 @@ def test_a_walk_goes_on_without_its_link_and_is_told_whole_when_that_is_back(
         chunks = {c.number: c.data for c in back.of(RecordingChunk)}
         assert b"".join(chunks[n] for n in sorted(chunks)) == data
         back.close()
+
+
+def test_a_new_attempt_takes_the_place_of_one_that_gets_ready(tmp_path: Path) -> None:
+    """The first has its start pose and waits to settle, for long; nobody waits for that."""
+    policy = bundle(tmp_path / "policies" / "still", standing())
+    with at_work(tmp_path, speed=1.0, more="[control]\nsettle = 8.0\n") as (made, gateway):
+        first = assign(policy, "a", horizon=0.4)
+        gateway.send(first)
+        wait(lambda: made.health()["stage"] == "settling", 20, made.log)
+        gateway.send(replace(first, attempt=2))
+        ended = gateway.wait(Finished, told=made.log)
+        assert (ended.attempt, ended.reason) == (1, "superseded by attempt 2")
+        wait(lambda: [a.attempt for a in gateway.of(Armed)] == [1, 2], 5, made.log)
+        assert not gateway.of(Running)
+
+
+def test_an_agent_that_starts_anew_lets_windings_cool_first(tmp_path: Path) -> None:
+    """Down to 0.4 of the allowed heat: 18 s of the robot's time, which lock-step need not wait."""
+    policy = bundle(tmp_path / "policies" / "still", standing())
+    (tmp_path / "state").mkdir()
+    told = {"share": 1.0, "at": time.time()}
+    (tmp_path / "state" / "warmth").write_text(json.dumps(told))
+    with at_work(tmp_path) as (made, gateway):
+        gateway.send(assign(policy, "a"))
+        wait(lambda: made.health()["waiting"] == "cool", 10, made.log)
+        before = time.monotonic()
+        gateway.wait(Running, told=made.log)
+        assert time.monotonic() - before < 18
 
 
 def test_nonsense_of_this_computer_does_not_end_the_agent(tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
 """Each rule of safety stops the robot for its own reason, and only for that."""
 
+import json
 import math
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,11 @@ from hardware_agent.config import SafetySettings
 from hardware_agent.imu import Board, Orientation
 from hardware_agent.limits import Applied, Limiter
 from hardware_agent.metronome import Metronome
+from hardware_agent.plausible import Plausible
 from hardware_agent.registers import REGISTERS, angle, ticks
 from hardware_agent.safety import Guard
 from hardware_agent.senses import Response, Senses, Trip
+from hardware_agent.warmth import Warmth
 
 NAMES = ("hip", "knee", "ankle")
 PERIOD = 1 / 33
@@ -51,6 +55,7 @@ def senses(time: float = 10.0, **changes: Any) -> Senses:
         goal=POSE.copy(),
         written=time - PERIOD,
         walking=True,
+        alone=True,
     )
     return replace(well, **changes)
 
@@ -179,6 +184,7 @@ def test_a_motor_may_give_much_for_a_moment_but_not_for_long() -> None:
 def test_a_winding_cools_while_torque_is_off_and_no_faster(rest: float) -> None:
     guard = Guard(LIMITS, 1.0)
     on = 10.0 + given_up(guard, 10.0) + rest
+    guard.rest(senses(on))
     guard.reset()
     left = 0.65**2 * math.exp(-rest / 20)
     expected = 20 * math.log((1 - left) / (1 - 0.65**2))
@@ -190,8 +196,52 @@ def test_one_servo_that_lies_about_the_voltage_stops_nobody() -> None:
 
 
 def test_a_robot_that_is_lifted_may_lie() -> None:
-    lying = {"imu": imu(pitch=1.5), "walking": False}
+    lying = {"walking": False, "alone": False}
     assert run(lambda t: lying | {"imu": imu(pitch=1.5, noise=t)}) is None
+
+
+def test_a_robot_that_stands_on_its_own_may_fall_too() -> None:
+    """Before the walk's first tick and after its last."""
+    tripped = run(lambda t: {"walking": False, "imu": imu(pitch=1.5, noise=t)})
+    assert tripped is not None and (tripped.rule, tripped.response) == ("fall", Response.SOFT)
+
+
+def test_heat_outlives_the_agent(tmp_path: Path) -> None:
+    """A stalled motor, the agent is killed; the next one gives the motor what is left."""
+    guard = Guard(LIMITS, 1.0)
+    given_up(guard, 10.0)
+    assert Warmth(tmp_path / "warmth", 20.0).left() == 0.0, "none was known"
+    Warmth(tmp_path / "warmth", 20.0).keep(guard.heat)
+    told = json.loads((tmp_path / "warmth").read_text())
+    (tmp_path / "warmth").write_text(json.dumps(told | {"at": told["at"] - 20.0}))
+    again = Guard(LIMITS, 1.0)
+    again.warm(Warmth(tmp_path / "warmth", 20.0).left())
+    assert again.heat == pytest.approx(math.exp(-1.0), abs=0.02)
+    assert given_up(again, 500.0) < 0.8 * -20 * math.log(1 - 0.65**2)
+    for damaged in ("", "{}", '{"share": 7, "at": 0}', '{"share": null, "at": 0}', "[]"):
+        (tmp_path / "warmth").write_text(damaged)
+        assert Warmth(tmp_path / "warmth", 20.0).left() == 1.0, "who does not know waits"
+
+
+def test_a_reading_that_cannot_be_is_believed_only_when_it_is_repeated() -> None:
+    told = Plausible()
+    assert told.believes(7, 0.5, 0.0)
+    assert not told.believes(7, 55.2, 0.03), "no servo is there"
+    assert not told.believes(7, 1.3, 0.03), "nor can it be there already"
+    assert told.believes(7, 0.55, 0.04)
+    assert not told.believes(7, 1.3, 0.05), "what was doubted before is forgotten"
+    assert told.believes(7, 1.32, 0.06), "it was struck"
+    assert told.believes(7, -1.3, 0.6), "half a second is time enough"
+    assert told.believes(8, -1.3, 0.6), "another servo"
+
+
+@given(st.lists(st.floats(-1, 1), min_size=2, max_size=30))
+def test_a_servo_that_moves_as_servos_can_is_always_believed(moves: list[float]) -> None:
+    """Ticks of 30 ms at up to the free speed, 5.76 rad/s."""
+    told, position = Plausible(), 0.0
+    for k, move in enumerate(moves):
+        position = min(3.1, max(-3.1, position + 0.03 * 5.76 * move))
+        assert told.believes(1, position, 0.03 * k)
 
 
 def test_a_fast_fall_is_foreseen() -> None:

@@ -1,0 +1,71 @@
+"""When a robot is on its own feet, so that a large tilt is a fall."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from agents import DARWIN, bundle, standing
+
+from hardware_agent.activities import WATCHED, Activity, Event, Hold, Settle, Walk
+from hardware_agent.config import ControlSettings
+from hardware_agent.imu import Orientation
+from hardware_agent.policies import Shelf
+from hardware_agent.rollout import Rollout
+from hardware_agent.senses import Senses
+from pup.wire import Assign
+
+PERIOD = 1 / 33
+
+
+def senses(time: float, pose: np.ndarray) -> Senses:
+    n = len(pose)
+    unknown = np.full(n, np.nan)
+    sample = Orientation(0.0, 0.0, 0.0, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+    return Senses(
+        time=time,
+        names=DARWIN.joint_names,
+        position=pose,
+        velocity=unknown,
+        load=unknown,
+        voltage=np.full(n, 12.0),
+        temperature=np.full(n, 30.0),
+        alarms={},
+        seen=np.full(n, time),
+        imu=sample,
+        imu_seen=time,
+        has_imu=True,
+        goal=pose,
+        written=time,
+        walking=True,
+        alone=True,
+    )
+
+
+@pytest.fixture
+def rollout(tmp_path: Path) -> Rollout:
+    bundle(tmp_path / "policies" / "still", standing())
+    shelf = Shelf(tmp_path / "policies", DARWIN)
+    return Rollout(shelf.load(shelf.policies()[0].sha256), (0.0, 0.0, 0.0), 33)
+
+
+def test_it_is_from_when_it_stands_ready_until_it_is_taken(rollout: Rollout) -> None:
+    assign = Assign("study", "t", 1, 1, "0" * 64, (0.0, 0.0, 0.0), 1.0)
+    told: list[Event] = []
+    settle = Settle(assign, rollout, np.zeros(2), ControlSettings(settle=0.5), told.append)
+    doing: Activity = settle
+    phases: list[tuple[str, bool]] = []
+    for k in range(round((0.5 + 1.0 + 0.5 + WATCHED + 1.0) / PERIOD) + 5):
+        settle.placed = k > 3
+        settle.go = settle.told
+        _, doing = doing.step(senses(k * PERIOD, rollout.pose))
+        phases.append((type(doing).__name__, doing.alone))
+    distinct = [p for p, before in zip(phases, [None, *phases], strict=False) if p != before]
+    assert distinct == [
+        ("Settle", False),
+        ("Settle", True),
+        ("Walk", True),
+        ("Ramp", True),
+        ("Hold", False),
+    ]
+    assert phases.count(("Ramp", True)) == pytest.approx((0.5 + WATCHED) / PERIOD, abs=4)
+    assert isinstance(doing, Hold) and not isinstance(doing, Walk)
