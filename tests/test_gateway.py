@@ -219,6 +219,8 @@ def test_an_operator_holds_the_gate(service):
         assert http.post("/v1/agents/gate-1:stop", json={"reason": "smoke"}).status_code == 202
         until(lambda: agent.state == "stopped")
         until(lambda: "stopped" in [a["state"] for a in http.get("/v1/agents").json()["agents"]])
+        until(lambda: http.get("/v1/studies/gated").json()["state"] == "paused")
+        assert http.post("/v1/studies/gated:resume").status_code == 200
         until(lambda: http.get("/v1/studies/gated").json()["open"] == 2)
         assert http.post("/v1/studies/gated/trials/2:release").status_code == 200
         until(lambda: "is stopped" in http.get("/v1/studies/gated").json()["waits_for"])

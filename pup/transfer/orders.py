@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from pup.transfer.study import HANDED_OUT, Study, StudyState, TrialError, TrialState
+from pup.transfer.study import Study, StudyState, TrialError, TrialState
 
 
 def release(study: Study, number: int) -> Study:
@@ -23,7 +23,7 @@ def retry(study: Study, number: int, attempt: int) -> Study:
 
 
 def pause(study: Study, reason: str) -> Study:
-    """Make no more trials; the one under way ends as it may."""
+    """Make no more trials and hand none out; the one that an agent has ends as it may."""
     _not_done(study)
     return replace(study, state=StudyState.PAUSED, reason=reason)
 
@@ -35,13 +35,11 @@ def resume(study: Study) -> Study:
 
 
 def cancel(study: Study, number: int, reason: str) -> Study:
-    """Take a trial back that nobody has; of one that an agent has, only make no more after it."""
+    """Take a trial back that nobody has, or have its agent end it; make no more after it."""
     trial = study.trial(number)
-    if trial.state is TrialState.REQUESTED:
-        study = study.with_trial(trial.withdraw(reason))
-    elif trial.state not in HANDED_OUT:
-        raise TrialError(f"trial {trial.id} is {trial.state}; it cannot be cancelled")
-    return pause(study, f"trial {number}: {reason}")
+    requested = trial.state is TrialState.REQUESTED
+    trial = trial.withdraw(reason) if requested else trial.recall()
+    return pause(study.with_trial(trial), f"trial {number}: {reason}")
 
 
 def after_end(study: Study) -> Study:

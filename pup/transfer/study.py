@@ -205,6 +205,7 @@ class Trial:
       fence: of the last handing-out; 0 before the first.
       agent: that it was handed out to.
       released: whether it passed the gate of the study.
+      cancelled: whether an operator wants its agent to end it.
       result: how it ended; None while it is open or lost.
     """
 
@@ -217,6 +218,7 @@ class Trial:
     fence: int = 0
     agent: str | None = None
     released: bool = False
+    cancelled: bool = False
     result: Result | None = None
 
     @property
@@ -269,6 +271,12 @@ class Trial:
             raise TrialError(f"trial {self.id} is {self.state} and has no lease")
         return replace(self, state=S.LOST)
 
+    def recall(self) -> "Trial":
+        """Have its agent end it, however long it takes until the agent hears of it."""
+        if self.state not in HANDED_OUT:
+            raise TrialError(f"trial {self.id} is {self.state}; it cannot be cancelled")
+        return replace(self, cancelled=True)
+
     def withdraw(self, reason: str) -> "Trial":
         """Take it back before anybody was asked to run it."""
         if self.state is not S.REQUESTED:
@@ -291,9 +299,8 @@ class Trial:
             raise TrialError(
                 f"attempt {attempt} of trial {self.id}; the next is {self.attempt + 1}"
             )
-        return replace(
-            self, state=S.REQUESTED, attempt=attempt, agent=None, released=True, result=None
-        )
+        fresh = Trial(self.study, self.number, self.eta, self.purpose)
+        return replace(fresh, attempt=attempt, fence=self.fence, released=True)
 
     def _judge(self, ticket: Ticket) -> Verdict:
         ours = Ticket(self.attempt, self.fence, self.agent or "")

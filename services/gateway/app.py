@@ -236,7 +236,7 @@ async def stream_study(request: Request, _: Viewer, study: StudyName) -> Respons
 async def pause_study(
     request: Request, user: Operator, study: StudyName, why: Reason, key: IdempotencyKey = None
 ) -> Response:
-    """Make no more trials; the one under way ends as it may."""
+    """Make no more trials and hand none out; the one that an agent has ends as it may."""
     order = partial(orders.pause, reason=f"{user.name}: {why.reason}")
     return as_json(
         study_document(await conductor_of(request).change(study, user.name, order, "paused"))

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from pup.transfer.study import HANDED_OUT, Study, Trial, TrialState
+from pup.transfer.study import HANDED_OUT, Study, StudyState, Trial, TrialState
 from pup.wire import Assign
 from services.gateway.agents import AgentView
 
@@ -33,6 +33,8 @@ def waits_for(study: Study, studies: Mapping[str, Study], agents: Mapping[str, A
         return ""
     if not trial.released:
         return "an operator to release it"
+    if study.state is StudyState.PAUSED:
+        return "the study to be resumed"
     reasons = unfit(study, studies, agents)
     fit = [name for name, why in reasons.items() if why is None]
     told = "; ".join(f"{name} {why}" for name, why in reasons.items())

@@ -163,21 +163,29 @@ class Conductor:
         reason = f"cancelled by {who}"
         order = partial(orders.cancel, number=number, reason=reason)
         study = await self.change(name, who, order, "cancelled")
-        trial = study.trial(number)
-        if trial.state in HANDED_OUT and trial.agent:
-            self.send(trial.agent, Cancel(trial.id, trial.attempt, trial.fence))
+        self._recall(study.trial(number))
         return study
 
     async def stop(self, agent: str, who: str, reason: str) -> None:
-        """Stop a robot, now; then pause what it was at."""
+        """Stop a robot, now; then pause what it was at, or would be next.
+
+        Raises:
+          TrialError: the agent is away; the robot may not hear of it.
+        """
         if agent not in self.agents:
             raise UnknownError(f"there is no agent {agent}")
         self.send(agent, Stop(f"{who}: {reason}"))
-        at = [s for s in self.studies.values() if s.open and s.open.agent == agent]
+        active = [s for s in self.studies.values() if s.state is StudyState.ACTIVE]
+        at = [s for s in active if agent in (s.settings.agent, s.open and s.open.agent)]
         await self.store.log([Event("stopped", who, detail={"agent": agent, "reason": reason})])
         for study in at:
             told = f"{agent} was stopped by {who}: {reason}"
             await self.change(study.name, who, partial(orders.pause, reason=told), "paused")
+        if not self.agents[agent].present:
+            raise TrialError(
+                f"{agent} is not connected and may not hear of it: use the switch at the robot; "
+                "its studies are paused"
+            )
 
     def heard(self, agent: str, trial: str | None) -> None:
         """A sign of life: it renews the lease of the trial that it names."""
@@ -305,7 +313,7 @@ class Conductor:
             trial = study.open
             if trial and trial.state in HANDED_OUT:
                 await self._watch(study, trial)
-            elif trial and trial.released:
+            elif trial and trial.released and study.state is StudyState.ACTIVE:
                 async with self._handing_out:
                     await self._hand_out(study, trial)
             elif not isinstance(step := next_step(study), Wait):
@@ -320,8 +328,18 @@ class Conductor:
             study = orders.after_end(study.with_trial(lost))
             await self._write(Change(study, [lost], [event]))
             self.metrics.trials.labels("lost").inc()
-        elif trial.state is TrialState.ASSIGNED and now - self._sent.get(trial.id, 0.0) > RESEND:
+        elif now - self._sent.get(trial.id, 0.0) <= RESEND:
+            return
+        elif trial.cancelled:
+            self._recall(trial)
+        elif trial.state is TrialState.ASSIGNED:
             self._assign(study, trial)
+
+    def _recall(self, trial: Trial) -> None:
+        """Ask its agent to end a trial that is cancelled; until it has."""
+        if trial.cancelled and trial.state in HANDED_OUT and trial.agent:
+            self._sent[trial.id] = time.monotonic()
+            self.send(trial.agent, Cancel(trial.id, trial.attempt, trial.fence))
 
     async def _hand_out(self, study: Study, trial: Trial) -> None:
         reasons = unfit(study, self.studies, self.agents)

@@ -7,8 +7,10 @@ key of each agent in `curve/agents/<name>.key`. The name of the file is the name
 
 import hashlib
 import hmac
+import logging
 import os
 import secrets
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -19,6 +21,10 @@ import zmq.auth
 from pup.errors import InputError
 from pup.files import read_json, write_json
 from services.gateway.names import is_name
+
+log = logging.getLogger(__name__)
+Stamp = dict[str, tuple[int, int]]
+"""When files were changed, in ns, and their sizes, by name."""
 
 SCHEMA = 1
 
@@ -141,10 +147,24 @@ class KeyRing:
             _create(self.folder, "gateway")
         return _pair(file)
 
+    def stamp(self) -> Stamp:
+        """Tells whether the agents' keys changed."""
+        found = {}
+        for file in self.agents_folder.glob("*.key"):
+            with suppress(FileNotFoundError):
+                status = file.stat()
+                found[file.name] = (status.st_mtime_ns, status.st_size)
+        return found
+
     def agents(self) -> dict[bytes, str]:
         """Names of the agents that are let in, by their public keys."""
-        files = sorted(self.agents_folder.glob("*.key"))
-        return {zmq.auth.load_certificate(f)[0]: f.stem for f in files}
+        known = {}
+        for file in sorted(self.agents_folder.glob("*.key")):
+            try:
+                known[zmq.auth.load_certificate(file)[0]] = file.stem
+            except (OSError, ValueError) as error:  # being copied, say; others go on
+                log.warning("no CURVE key", extra={"file": str(file), "why": str(error)})
+        return known
 
     def create_agent(self, name: str, out: Path) -> tuple[Path, Path]:
         """Make the keys of an agent: the public one is let in, the secret one goes to the robot.

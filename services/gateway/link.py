@@ -38,7 +38,7 @@ from pup.wire import (
 from services.gateway.agents import AgentView
 from services.gateway.conductor import Conductor
 from services.gateway.config import Config
-from services.gateway.keys import KeyRing
+from services.gateway.keys import KeyRing, Stamp
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class Link:
         self.authenticator = AsyncioAuthenticator(self.context)
         self.socket = self.context.socket(zmq.ROUTER)
         self.bound = False
-        self._keys_at = -1
+        self._files: Stamp | None = None
         self._queues: dict[str, asyncio.Queue[Message]] = {}
         self._workers: list[asyncio.Task[None]] = []
 
@@ -109,12 +109,11 @@ class Link:
         return known
 
     def refresh_keys(self) -> None:
-        """Read the agents' keys where their folder changed; who is gone is let in no more."""
-        folder = self.ring.agents_folder
-        changed = folder.stat().st_mtime_ns if folder.exists() else 0
-        if changed == self._keys_at:
+        """Read the agents' keys where a file changed; who is gone is let in no more."""
+        files = self.ring.stamp()
+        if files == self._files:
             return
-        self.names, self._keys_at = self.ring.agents(), changed
+        self.names, self._files = self.ring.agents(), files
         for name in self.names.values():
             self.conductor.agents.setdefault(name, AgentView(name))
 
@@ -133,6 +132,8 @@ class Link:
                 log.warning("message refused", extra={"why": str(error)})
             except asyncio.QueueFull:
                 self.conductor.metrics.refused.labels("too many").inc()
+            except Exception:  # what one agent says must not end the others' link
+                log.exception("message failed")
 
     async def watch(self) -> None:
         """Notice keys that are revoked while their agents are connected."""
@@ -145,11 +146,7 @@ class Link:
         route = self.routes.get(agent)
         if route is None:
             return
-        try:
-            zmq.Socket.send_multipart(
-                self.socket, [route, encode(Message(body))], flags=zmq.DONTWAIT
-            )
-        except zmq.ZMQError as error:  # it went away, or does not read
+        if error := self._told(route, body):
             log.info("not sent", extra={"agent": agent, "why": str(error)})
 
     def close(self) -> None:
@@ -169,10 +166,24 @@ class Link:
         if agent is None:
             raise WireError("its key was revoked")
         message = decode(bytes(frames[1].buffer))
+        route = bytes(frames[0].buffer)
+        if self.routes.get(agent, route) != route and self._connected(self.routes[agent]):
+            raise WireError(f"another agent with the key of {agent} is connected")
         self.conductor.agents[agent].heard = time.monotonic()
-        self.routes[agent] = bytes(frames[0].buffer)
+        self.routes[agent] = route
         self.conductor.metrics.messages.labels(type(message.body).__name__).inc()
         return agent, message
+
+    def _connected(self, route: bytes) -> bool:
+        """Whether an agent is still there: a key that was copied must not move two robots."""
+        error = self._told(route, Heartbeat())
+        return error is None or isinstance(error, zmq.Again)
+
+    def _told(self, route: bytes, body: Body) -> BaseException | None:
+        """Send without waiting; why not: `zmq.Again` from who does not read, another from none."""
+        sent = self.socket.send_multipart([route, encode(Message(body))], flags=zmq.DONTWAIT)
+        assert sent.done(), "nothing else waits to be sent"
+        return sent.exception()
 
     def _queue(self, agent: str) -> asyncio.Queue[Message]:
         if agent not in self._queues:
