@@ -199,6 +199,28 @@ def test_a_gateway_that_was_replaced_writes_no_more(tmp_path):
     asyncio.run(both())
 
 
+def test_a_study_that_cannot_go_on_says_so_and_goes_on_when_it_can(tmp_path):
+    class Broken:
+        async def run(self, act, *args):
+            raise MemoryError
+
+    async def live():
+        store = Store(f"sqlite:///{tmp_path / 'broken.db'}")
+        conductor = Conductor(store, Broken(), Metrics())
+        study, _ = await conductor.create("s", SETTINGS, None, "test")
+        while "MemoryError" not in conductor.waits_for(study):
+            await asyncio.sleep(0.01)
+        assert not conductor.studies["s"].trials
+        conductor.fits = InProcess()
+        conductor.tick()
+        while not conductor.studies["s"].trials:
+            await asyncio.sleep(0.01)
+        assert "failed" not in conductor.waits_for(conductor.studies["s"])
+        store.close()
+
+    asyncio.run(asyncio.wait_for(live(), 20))
+
+
 def test_a_silent_agent_loses_the_trial_and_its_late_result_never_counts(tmp_path, quiet):
     async def live():
         store = Store(f"sqlite:///{tmp_path / 'late.db'}")

@@ -91,6 +91,7 @@ class Conductor:
         self._posteriors: dict[str, tuple[str, Row]] = {}
         self._changed: dict[str, asyncio.Event] = defaultdict(asyncio.Event)
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._trouble: dict[str, str] = {}
         self._wanted: set[str] = set()
         self._handing_out = asyncio.Lock()
 
@@ -265,8 +266,8 @@ class Conductor:
         self._changed.pop(name, asyncio.Event()).set()
 
     def waits_for(self, study: Study) -> str:
-        """What the open trial of a study waits for, in words."""
-        return waits_for(study, self.studies, self.agents)
+        """What a study waits for, in words."""
+        return self._trouble.get(study.name) or waits_for(study, self.studies, self.agents)
 
     def measure(self) -> None:
         """Bring the gauges up to date."""
@@ -301,9 +302,17 @@ class Conductor:
 
     def _looked(self, name: str, done: "asyncio.Task[None]") -> None:
         self._tasks.pop(name, None)
+        before, trouble = self._trouble.pop(name, ""), ""
         if not done.cancelled() and (error := done.exception()):
-            log.error("study failed", extra={"study": name}, exc_info=error)
-        elif name in self._wanted and not done.cancelled():
+            trouble = f"the gateway, which failed ({type(error).__name__}); see its log"
+            tell = log.debug if trouble == before else log.error  # it is tried again soon
+            tell("study failed", extra={"study": name}, exc_info=error)
+            self._trouble[name] = trouble
+        if trouble != before:
+            self.notify(name)
+        if trouble:
+            return
+        if name in self._wanted and not done.cancelled():
             self._go_on(name)
 
     async def _look(self, name: str) -> None:

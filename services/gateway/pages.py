@@ -1,6 +1,7 @@
 """The pages of what goes on: studies, jobs, one of them, agents. Nothing comes from elsewhere."""
 
 import asyncio
+import logging
 from pathlib import Path
 from urllib.parse import parse_qs
 
@@ -15,6 +16,8 @@ from services.gateway.conductor import Conductor
 from services.gateway.html import login, page, part
 from services.gateway.keys import Tokens
 from services.gateway.records import study_document, trial_document
+
+log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parent / "static"
 YEAR = 365 * 86400
@@ -77,7 +80,11 @@ async def one(request: Request, study: str) -> Response:
         return login()
     conductor: Conductor = request.app.state.conductor
     found = conductor.study(study)
-    posterior = await conductor.posterior(study)
+    try:
+        posterior = await conductor.posterior(study)
+    except Exception as error:  # whoever holds the gate needs the page all the same
+        log.error("no posterior", extra={"study": study}, exc_info=error)
+        posterior = {"best": None}
     trial, sample = found.open, None
     view = conductor.agents.get(trial.agent or "") if trial else None
     if view and trial and view.sample and view.sample.trial == trial.id:
