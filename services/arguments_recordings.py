@@ -126,7 +126,7 @@ def blind(verb: argparse.ArgumentParser) -> None:
     """The actions on sealed sets."""
     actions = verb.add_subparsers(title="actions", required=True, dest="action", metavar="ACTION")
     for name, told, fill in (
-        ("make", "make a sealed set; run again, it resumes", _blind_make),
+        ("make", "make a sealed set; run again after a stop, it resumes", _blind_make),
         ("run", "diagnose all cases of a set; run again, it resumes", _blind_run),
         ("score", "score the verdicts on a set", _blind_score),
     ):

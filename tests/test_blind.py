@@ -115,6 +115,9 @@ def test_the_same_seed_makes_the_same_bytes_and_a_stopped_set_goes_on(tmp_path: 
 
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path / "a", stop_after=1)
+    (part,) = (p for p in (tmp_path / "a" / "key.parts").iterdir() if p.name != "set.json")
+    part.unlink()  # as if killed while it was writing this case
+    (tmp_path / "a" / "set" / f"case_{part.stem}" / "recordings" / "r99.parquet").touch()
     assert make(tmp_path / "a") == make(tmp_path / "b")
 
 

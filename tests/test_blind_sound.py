@@ -7,9 +7,11 @@ import pytest
 from test_blind_effects import plans, world_of
 
 from pup.blind.absorb import readings
-from pup.blind.catalogue import KINDS, available, draw, plausible, unlisted
-from pup.blind.drafts import NUISANCE, draw_case
+from pup.blind.cases import NULLS, STRATA
+from pup.blind.catalogue import KINDS, MASKED, available, draw, plausible, unlisted
+from pup.blind.drafts import NUISANCE, draw_case, draw_null
 from pup.blind.kit import Kit
+from pup.blind.make import ROBOTS
 from pup.blind.sensors import Noise
 from pup.blind.sound import converged, shrinks
 from pup.blind.world import STEP, Effect, Engine, Place, Plan, World, steady
@@ -20,6 +22,7 @@ QUIET = Noise(position=0.0, quantum=0.0)
 STEP_FREE = 2e-5  # rad, rms; the nominal motion itself changes as much with the step
 VANISHED, SAME = 0.05, 0.08  # shares of the change at typical size
 SWITCHED = 0.25  # the same of what jumps from level to level, at the next step at the earliest
+SEEDS = 150
 BRIEF = 30  # ticks, up to a moment without torque
 DISTAL = Place("joint", ("l_ank_roll",))  # carries the lightest link
 
@@ -143,6 +146,34 @@ def test_no_draw_is_of_a_size_that_no_robot_has(
                 except InputError:
                     continue
                 assert all(plausible(effect, kit) for effect in draft.effects)
+
+
+@pytest.mark.parametrize(
+    ("name", "ground"), [*((name, False) for name in ROBOTS), ("darwin_op2", True)]
+)
+def test_every_kind_of_case_can_be_drawn(
+    name: str, ground: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without motions, which take long and hang on the robot alone."""
+    monkeypatch.setattr("pup.blind.drafts.programme", lambda *given: ())
+    monkeypatch.setattr("pup.blind.drafts._stopped", lambda draft, effect: effect)
+    robot = RobotDescription.load(name)
+    for stratum in STRATA:
+        drawn = 0
+        for seed in range(SEEDS):
+            try:
+                draft = draw_case(robot, stratum, ground, np.random.default_rng(seed))
+            except InputError:  # drawn anew by the caller
+                continue
+            drawn += 1
+            assert draft.stratum == stratum
+            assert len(draft.effects) == (2 if stratum == "pair" else 1)
+            assert stratum != "masked" or draft.effects[0].name in MASKED
+        assert drawn > SEEDS / 2, stratum
+    for kind in NULLS:
+        for seed in range(SEEDS):
+            null = draw_null(robot, kind, ground, np.random.default_rng(seed))
+            assert null.stratum == f"null:{kind}" and not null.effects
 
 
 def test_sizes_out_of_range_are_refused() -> None:

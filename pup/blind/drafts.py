@@ -171,13 +171,7 @@ def draw_case(
     kit = Kit.of(robot, ground)
     if stratum == "unidentifiable":
         return _unidentifiable(kit, rng)
-    names = list(available(kit))
-    if ground and rng.uniform() < 0.6:
-        names = [n for n in names if KINDS[n].where == "ground" or "body" in KINDS[n].places]
-    if stratum == "masked":
-        names = [n for n in names if n in MASKED]
-    if stratum in ("below_noise", "weak"):
-        names = [n for n in names if n != "joint_stop"]
+    names = _candidates(kit, stratum, rng)
     if stratum == "unlisted":
         effects = [draw(str(rng.choice(unlisted())), kit, rng)]
     else:
@@ -200,6 +194,19 @@ def draw_case(
     nuisance = _nuisance(kit, effects, rng) if rng.uniform() < 0.5 else ()
     world = replace(draft.world, effects=tuple(effects))
     return replace(draft, world=world, nuisance=nuisance, room=SIZES[1] / factor)
+
+
+def _candidates(kit: Kit, stratum: str, rng: np.random.Generator) -> list[str]:
+    """Effects that a stratum is drawn from; on the ground mostly those that only show there."""
+    names = list(available(kit))
+    local = kit.ground and rng.uniform() < 0.6  # drawn for all strata: seeds keep their meaning
+    if stratum == "masked":  # none of these is of the ground or of a body
+        return [n for n in names if n in MASKED]
+    if local:
+        names = [n for n in names if KINDS[n].where == "ground" or "body" in KINDS[n].places]
+    if stratum in ("below_noise", "weak"):
+        names = [n for n in names if n != "joint_stop"]
+    return names
 
 
 def _stopped(draft: Draft, effect: Effect) -> Effect:

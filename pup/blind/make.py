@@ -78,6 +78,7 @@ def make_set(
             robot = robots[order.robot]
             made = make_case(robot, order.stratum, order.ground, order.seed, order.id)
             folder = out / f"case_{order.id}"
+            shutil.rmtree(folder, ignore_errors=True)  # what a call that was killed left of it
             write_recordings(made.recordings, folder / "recordings")
             if made.tests:
                 write_recordings(made.tests, folder / "test")
