@@ -159,5 +159,7 @@ class Virtual:
 
 
 def _number(trial: str) -> int:
-    """A number that a trial's name stands for, whichever attempt it is."""
-    return int.from_bytes(hashlib.sha256(trial.encode()).digest()[:8], "big")
+    """A number that a trial's name stands for, whichever attempt and study of this name it is."""
+    study, _, number = trial.rpartition("/")
+    name = f"{study}/{number.partition('.')[0]}" if study else trial
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")

@@ -82,6 +82,7 @@ class FakeAgent:
         self.journal = journal or Journal()
         self.walk, self.address, self.beat, self.pause = walk, address, beat, pause
         self.state = AgentState.ENABLED
+        self.deaf = False
         self.received: list[Body] = []
         self.refused: list[tuple[str, int, int]] = []
         self._fence: dict[str, int] = {}
@@ -159,7 +160,7 @@ class FakeAgent:
                         *ticket, Outcome.ABORTED, reason="cancelled"
                     )
                     self._resend()
-            case Stop():
+            case Stop() if not self.deaf:
                 self.state = AgentState.STOPPED
 
     def _assigned(self, body: Assign) -> None:

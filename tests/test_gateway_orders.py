@@ -105,6 +105,39 @@ def test_a_key_that_was_copied_to_a_second_robot_moves_one(service):
         second.close(0)
 
 
+def test_a_stop_is_sent_each_time_and_until_it_is_obeyed(service):
+    """By the same idempotency key too; the agent that went deaf for a moment hears it then."""
+    keys = service.agent_keys("deaf")
+    walk = fake_agent.walks(lambda eta: 0.5)
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk) as agent:
+        until(lambda: any(a["name"] == "deaf" and a["state"] for a in _agents(http)))
+        for _ in range(2):
+            agent.state = AgentState.ENABLED
+            until(lambda: _agent(http, "deaf")["state"] == "enabled")
+            headers = {"Idempotency-Key": "the-button"}
+            answer = http.post("/v1/agents/deaf:stop", json={"reason": "smoke"}, headers=headers)
+            assert answer.status_code == 202 and agent.state is AgentState.STOPPED
+        agent.state, agent.deaf = AgentState.ENABLED, True
+        until(lambda: _agent(http, "deaf")["state"] == "enabled")
+        answer = http.post("/v1/agents/deaf:stop", json={"reason": "smoke"})
+        assert answer.status_code == 409 and "not said that it stopped" in answer.text
+        agent.deaf = False
+        until(lambda: agent.state is AgentState.STOPPED, 10)
+
+
+def test_a_study_made_anew_does_not_get_the_walks_of_an_old_one(service):
+    """The robot's journal knows a study of this name: of a gateway whose database is gone."""
+    keys = service.agent_keys("reborn")
+    walk = fake_agent.walks(lambda eta: 0.5)
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk) as agent:
+        names = set()
+        for name in ("first", "second"):
+            http.post("/v1/studies", json=STUDY | {"name": name, "agent": "reborn"})
+            service.wait_for(name)
+            names.add(agent.journal.walked[-1][0].replace(name, "same"))
+    assert len(names) == 2 and all(name.startswith("same/1.") for name in names)
+
+
 def test_a_key_file_that_is_being_written_ends_nobody(service, tmp_path):
     keys = service.agent_keys("half")
     file = KeyRing(service.data / "curve").agents_folder / "half.key"

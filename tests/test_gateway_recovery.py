@@ -4,6 +4,8 @@ import asyncio
 import random
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections import Counter
 from dataclasses import asdict
@@ -197,6 +199,33 @@ def test_a_gateway_that_was_replaced_writes_no_more(tmp_path):
         new.close()
 
     asyncio.run(both())
+
+
+KILLED = """
+import os, sys
+from alembic import op
+from services.gateway.store import Store
+left, original = [int(sys.argv[2])], getattr(op, sys.argv[3])
+def dying(*args, **options):
+    original(*args, **options)
+    left[0] -= 1
+    if not left[0]:
+        os._exit(9)
+setattr(op, sys.argv[3], dying)
+Store(sys.argv[1])
+"""
+
+
+@pytest.mark.parametrize(
+    ("step", "kind"), [(3, "create_table"), (6, "create_table"), (1, "add_column")]
+)
+def test_a_death_in_a_migration_leaves_a_database_that_can_be_opened(tmp_path, step, kind):
+    url = f"sqlite:///{tmp_path / 'half.db'}"
+    ended = subprocess.run([sys.executable, "-c", KILLED, url, str(step), kind], timeout=60)
+    assert ended.returncode == 9, "it was killed there"
+    store = Store(url)
+    assert asyncio.run(store.studies()) == []
+    store.close()
 
 
 def test_a_study_that_cannot_go_on_says_so_and_goes_on_when_it_can(tmp_path):

@@ -1,6 +1,7 @@
 """The optimiser of eta: determinism, bounds, noise, warm start, bad inputs, time."""
 
 import time
+from dataclasses import replace
 
 import landscapes
 import numpy as np
@@ -159,6 +160,19 @@ def test_bad_data_is_refused(eta, distance):
 def test_bad_simulated_rollouts_are_refused(eta, distance):
     with pytest.raises(InputError):
         Simulated(eta, distance)
+
+
+def test_an_infeasible_eta_is_never_chosen():
+    """Where every walk went backwards, nowhere would be best."""
+    rng = np.random.default_rng(0)
+    for seed in range(5):
+        eta, feasible = rng.uniform(-1, 1, (8, 3)), np.arange(8) % 3 > 0
+        distance = np.where(feasible, rng.uniform(-0.5, -0.1, 8), 0.0)
+        made = replace(search(eta, distance, seed), feasible=feasible)
+        chosen = np.abs(eta - choose(made).eta).sum(axis=1).argmin()
+        assert feasible[chosen]
+    with pytest.raises(InputError, match="no eta was feasible"):
+        choose(replace(made, feasible=np.zeros(8, bool)))
 
 
 def test_nothing_can_be_chosen_of_nothing():

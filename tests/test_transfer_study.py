@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pup.errors import InputError
+from pup.transfer import orders
 from pup.transfer.steps import Choose, Finish, Suggest, Wait, Walk, next_step
 from pup.transfer.study import (
     HANDED_OUT,
@@ -224,6 +225,21 @@ def test_failures_in_a_row_are_counted():
         trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0))
         study = study.with_trial(trial)
     assert study.failures() == 2
+
+
+def test_a_retried_trial_that_fails_again_pauses_its_study():
+    """Though others have succeeded since."""
+    study = Study("s", SETTINGS)
+    for number, state in enumerate([S.ABORTED, S.SUCCEEDED, S.SUCCEEDED], 1):
+        trial = fresh(number).release().assign("a", number)
+        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0))
+        study = study.with_trial(trial)
+    assert study.failures() == 0
+    study = orders.retry(study, 1, 2)
+    trial = study.trial(1).assign("a", 9)
+    trial, _ = trial.finish(Ticket(2, 9, "a"), Result(S.ABORTED, reason="fell asleep"))
+    study = orders.after_end(study.with_trial(trial), trial)
+    assert study.state is StudyState.PAUSED and "trial 1 was aborted" in study.reason
 
 
 @pytest.mark.parametrize(

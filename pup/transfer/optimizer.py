@@ -47,6 +47,7 @@ class Search:
       eta: of the walks so far, shape (n, n_eta).
       distance: of them, m, shape (n,).
       simulated: rollouts to start from, or None.
+      feasible: which walks were, shape (n,); None for all. The others are never chosen.
     """
 
     lower: Eta
@@ -56,6 +57,7 @@ class Search:
     eta: Array
     distance: Array
     simulated: Simulated | None = None
+    feasible: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         if self.eta.shape != (len(self.distance), len(self.lower)):
@@ -81,6 +83,19 @@ class Search:
         if self.simulated is None:
             return None
         return landscapes(self.simulated, np.array(self.lower), np.array(self.upper))
+
+    def best(self, surrogate: Surrogate) -> Array:
+        """Of the feasible etas tried, the one with the largest posterior mean, on the unit cube.
+
+        Raises:
+          InputError: there is none.
+        """
+        tried = self.told.eta
+        if self.feasible is not None:
+            tried = tried[self.feasible]
+        if not len(tried):
+            raise InputError("no eta was feasible, so nothing can be chosen")
+        return np.asarray(tried[np.argmax(surrogate.predict(tried)[0])])
 
     def real(self, unit: Array) -> Array:
         """Etas of the box from those of the unit cube."""
@@ -157,7 +172,7 @@ def choose(search: Search) -> Decision:
     if not len(search.distance):
         raise InputError("nothing was walked yet, so nothing can be chosen")
     surrogate = surrogate_of(search.told, search.prior)
-    unit = search.told.eta[np.argmax(surrogate.predict(search.told.eta)[0])]
+    unit = search.best(surrogate)
     why = "largest posterior mean of the etas tried"
     return _decision(search, surrogate, unit, Purpose.REPEAT, why, None, began)
 
@@ -182,7 +197,7 @@ class Slice:
 def slices(search: Search, points: int = 41) -> tuple[Slice, ...]:
     """The process through the eta that would be chosen now, a slice for each entry."""
     surrogate = surrogate_of(search.told, search.prior)
-    best = search.told.eta[np.argmax(surrogate.predict(search.told.eta)[0])]
+    best = search.best(surrogate)
     drawn = []
     for entry in range(len(search.lower)):
         line = np.tile(best, (points, 1))

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from pup.transfer.study import Study, StudyState, TrialError, TrialState
+from pup.transfer.study import TOLD, Study, StudyState, Trial, TrialError, TrialState
 
 
 def release(study: Study, number: int) -> Study:
@@ -42,12 +42,17 @@ def cancel(study: Study, number: int, reason: str) -> Study:
     return pause(study.with_trial(trial), f"trial {number}: {reason}")
 
 
-def after_end(study: Study) -> Study:
-    """Pause a study whose trials keep giving no result."""
-    failed, active = study.failures(), study.state is StudyState.ACTIVE
-    if not active or failed < study.settings.failures:
+def after_end(study: Study, last: Trial) -> Study:
+    """Pause a study whose trials keep giving no result, or whose retried trial gave none.
+
+    Args:
+      study: with the trial.
+      last: that has just ended.
+    """
+    active = study.state is StudyState.ACTIVE and last.state not in TOLD
+    again = last.attempt > 1 and last.number < len(study.trials)
+    if not active or (study.failures() < study.settings.failures and not again):
         return study
-    last = study.trials[-1]
     why = last.result.reason if last.result else "nothing was heard of it"
     told = f"trial {last.number} was {last.state} ({why}); retry it, or resume without it"
     return replace(study, state=StudyState.PAUSED, reason=told)

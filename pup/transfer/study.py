@@ -207,6 +207,7 @@ class Trial:
       released: whether it passed the gate of the study.
       cancelled: whether an operator wants its agent to end it.
       result: how it ended; None while it is open or lost.
+      mark: of its study; see Study.
     """
 
     study: str
@@ -220,11 +221,17 @@ class Trial:
     released: bool = False
     cancelled: bool = False
     result: Result | None = None
+    mark: str = ""
 
     @property
     def id(self) -> str:
-        """Names the trial on the wire."""
+        """Names the trial to people."""
         return f"{self.study}/{self.number}"
+
+    @property
+    def wire(self) -> str:
+        """Names it on the wire, where an agent may remember one of another gateway."""
+        return f"{self.id}.{self.mark}" if self.mark else self.id
 
     def release(self) -> "Trial":
         """Let it pass the gate; a second time changes nothing."""
@@ -300,7 +307,7 @@ class Trial:
                 f"attempt {attempt} of trial {self.id}; the next is {self.attempt + 1}"
             )
         fresh = Trial(self.study, self.number, self.eta, self.purpose)
-        return replace(fresh, attempt=attempt, fence=self.fence, released=True)
+        return replace(fresh, mark=self.mark, attempt=attempt, fence=self.fence, released=True)
 
     def _judge(self, ticket: Ticket) -> Verdict:
         ours = Ticket(self.attempt, self.fence, self.agent or "")
@@ -325,6 +332,7 @@ class Study:
       fence: the last token given out.
       chosen: the eta that was chosen; None before.
       trials: all of them, by number.
+      mark: tells it from another study of this name: of a gateway before this one, say.
     """
 
     name: str
@@ -334,6 +342,7 @@ class Study:
     fence: int = 0
     chosen: Eta | None = None
     trials: tuple[Trial, ...] = field(default=(), repr=False)
+    mark: str = ""
 
     def trial(self, number: int) -> Trial:
         """The trial of a number.

@@ -4,8 +4,10 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from pup.wire import AgentState, Heartbeat, Hello, Sample
+from pup.wire import AgentState, Heartbeat, Hello, Sample, Stop
 
+STILL = (AgentState.DISABLED, AgentState.STOPPED, AgentState.FAULT)
+"""States of a robot without torque."""
 SILENCE = 5.0
 """After which an agent counts as away, s."""
 
@@ -23,6 +25,7 @@ class AgentView:
       heard: monotonic time of the last message, s; -inf before the first.
       journal: trials that its journal knows of, as (trial, attempt, fence).
       sample: the newest of the rollout under way.
+      stop: that its robot was sent and has not obeyed yet.
     """
 
     name: str
@@ -33,6 +36,8 @@ class AgentView:
     heard: float = -float("inf")
     journal: set[tuple[str, int, int]] = field(default_factory=set)
     sample: Sample | None = None
+    stop: Stop | None = None
+    _shown: tuple[bool, AgentState | None] = (False, None)
 
     @property
     def present(self) -> bool:
@@ -48,6 +53,13 @@ class AgentView:
         """How it is."""
         self.state, self.health = heartbeat.state, heartbeat.health
         self.trial = heartbeat.trial
+        if self.state in STILL:
+            self.stop = None
+
+    def changed(self) -> bool:
+        """Whether it has come, gone or changed its state since it was asked this."""
+        before, self._shown = self._shown, (self.present, self.state)
+        return before != self._shown
 
     def sampled(self, sample: Sample) -> bool:
         """A sample of a rollout; whether it is newer than the last."""

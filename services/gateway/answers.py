@@ -35,7 +35,7 @@ def stream(request: Request, name: str) -> Response:
         yield f"retry: 2000\ndata: {revision}\n\n"
         while not await request.is_disconnected() and not request.app.state.stopping:
             now = await conductor.wait(name, revision, STREAM)
-            yield f"data: {now}\n\n" if now != revision else ": still here\n\n"
+            yield f"data: {now}\n\n" if now != revision else "event: alive\ndata: {}\n\n"
             revision = now
             await asyncio.sleep(0.5)  # a browser need not know sooner
 

@@ -50,6 +50,8 @@ Operator = Annotated[User, needs(Role.OPERATOR)]
 READ = responses(400, 401, 403, 404, 422)
 WRITE = responses(400, 401, 403, 404, 409, 411, 413, 422)
 v1 = APIRouter(prefix="/v1", route_class=IdempotentRoute)
+emergency = APIRouter(prefix="/v1")
+"""What must not wait for the database; done twice it does no harm."""
 
 
 def application(
@@ -82,6 +84,7 @@ def application(
     app.state.link, app.state.stopping = link, False
     app.state.shelves = shelves or Shelves({})
     app.include_router(v1)
+    app.include_router(emergency)
     app.include_router(job_routes.router)
     app.include_router(_service())
     app.include_router(pages.router)
@@ -313,11 +316,11 @@ async def stream_agents(request: Request, _: Viewer) -> Response:
     return stream(request, "")
 
 
-@v1.post("/agents/{agent:name}:stop", status_code=202, responses=WRITE)
+@emergency.post("/agents/{agent:name}:stop", status_code=202, responses=WRITE)
 async def stop_agent(
     request: Request, user: Operator, agent: AgentName, why: Reason, key: IdempotencyKey = None
 ) -> Response:
-    """Emergency stop by message; the switch at the robot is faster."""
+    """Emergency stop by message; the switch at the robot is faster. Each request sends one."""
     await conductor_of(request).stop(agent, user.name, why.reason)
     return as_json({"stopped": agent}, 202)
 

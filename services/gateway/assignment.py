@@ -49,7 +49,7 @@ def assignment(study: Study, trial: Trial) -> Assign:
     settings = study.settings
     return Assign(
         study.name,
-        trial.id,
+        trial.wire,
         trial.attempt,
         trial.fence,
         settings.policy,
@@ -61,8 +61,11 @@ def assignment(study: Study, trial: Trial) -> Assign:
 
 def place_of(trial: str, studies: Mapping[str, Study]) -> tuple[str, int] | None:
     """The study and number that an id of a trial stands for; None where there is no such trial."""
-    name, _, number = trial.rpartition("/")
+    name, _, rest = trial.rpartition("/")
+    number, _, mark = rest.partition(".")
     study = studies.get(name)
-    if study is None or not number.isascii() or not number.isdecimal() or len(number) > 9:
+    if study is None or study.mark != mark:
+        return None
+    if not number.isascii() or not number.isdecimal() or len(number) > 9:
         return None
     return (name, int(number)) if 1 <= int(number) <= len(study.trials) else None

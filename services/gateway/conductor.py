@@ -9,6 +9,7 @@ until it is acknowledged.
 
 import asyncio
 import logging
+import secrets
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -45,6 +46,8 @@ log = logging.getLogger(__name__)
 
 PERIOD = 0.5
 """Between two looks at leases, idle agents and unanswered assignments, s."""
+CONFIRMED = 2.0
+"""In which a robot must say that it has stopped, s."""
 RESEND = 2.0
 """Without an answer to an assignment until it is sent again, s."""
 
@@ -108,7 +111,15 @@ class Conductor:
             await asyncio.sleep(PERIOD)
 
     def tick(self) -> None:
-        """Look once at all studies."""
+        """Look once at all agents and studies."""
+        for view in self.agents.values():
+            if view.stop:
+                self.send(view.name, view.stop)
+            if view.changed():
+                self.notify("")
+                for study in self.studies.values():
+                    if view.name in (study.settings.agent, study.open and study.open.agent):
+                        self.notify(study.name)
         for name in list(self.studies):
             if self.studies[name].state is not StudyState.DONE:
                 self._go_on(name)
@@ -136,13 +147,14 @@ class Conductor:
         """
         async with self._locks[name]:
             if name in self.studies:
-                if self.studies[name].settings != settings:
+                same = simulated in (None, self.simulated[name])
+                if self.studies[name].settings != settings or not same:
                     raise TrialError(f"study {name} exists with other settings; use another name")
                 return self.studies[name], False
             event = Event("created", who, detail={"settings": asdict(settings)})
             self._heard[name] = time.monotonic()
             self.simulated[name] = simulated
-            study = Study(name, settings)
+            study = Study(name, settings, mark=secrets.token_hex(4))
             await self._write(Change(study, events=[event], simulated=simulated))
         self._go_on(name)
         return study, True
@@ -159,9 +171,9 @@ class Conductor:
         self._go_on(name)
         return study
 
-    async def cancel(self, name: str, number: int, who: str) -> Study:
+    async def cancel(self, name: str, number: int, who: str, reason: str = "") -> Study:
         """Take a trial back, or ask its agent to stop it; the study pauses."""
-        reason = f"cancelled by {who}"
+        reason = reason or f"cancelled by {who}"
         order = partial(orders.cancel, number=number, reason=reason)
         study = await self.change(name, who, order, "cancelled")
         self._recall(study.trial(number))
@@ -170,28 +182,38 @@ class Conductor:
     async def stop(self, agent: str, who: str, reason: str) -> None:
         """Stop a robot, now; then pause what it was at, or would be next.
 
+        It is told again until it says that it has stopped.
+
         Raises:
-          TrialError: the agent is away; the robot may not hear of it.
+          TrialError: it has not said so.
         """
         if agent not in self.agents:
             raise UnknownError(f"there is no agent {agent}")
-        self.send(agent, Stop(f"{who}: {reason}"))
-        active = [s for s in self.studies.values() if s.state is StudyState.ACTIVE]
-        at = [s for s in active if agent in (s.settings.agent, s.open and s.open.agent)]
+        view = self.agents[agent]
+        view.stop = Stop(f"{who}: {reason}")
+        self.send(agent, view.stop)
+        told = f"{agent} was stopped by {who}: {reason}"
+        for study in list(self.studies.values()):
+            if study.state is StudyState.DONE:
+                continue
+            if study.open and study.open.agent == agent and study.open.state in HANDED_OUT:
+                await self.cancel(study.name, study.open.number, who, told)
+            elif study.settings.agent == agent and study.state is StudyState.ACTIVE:
+                await self.change(study.name, who, partial(orders.pause, reason=told), "paused")
         await self.store.log([Event("stopped", who, detail={"agent": agent, "reason": reason})])
-        for study in at:
-            told = f"{agent} was stopped by {who}: {reason}"
-            await self.change(study.name, who, partial(orders.pause, reason=told), "paused")
-        if not self.agents[agent].present:
+        end = time.monotonic() + CONFIRMED
+        while view.stop and view.present and time.monotonic() < end:
+            await asyncio.sleep(0.05)
+        if view.stop:
             raise TrialError(
-                f"{agent} is not connected and may not hear of it: use the switch at the robot; "
-                "its studies are paused"
+                f"{agent} has not said that it stopped: use the switch at the robot; it is told "
+                "again, and its studies are paused"
             )
 
     def heard(self, agent: str, trial: str | None) -> None:
         """A sign of life: it renews the lease of the trial that it names."""
         study = self.studies.get((trial or "").rpartition("/")[0])
-        if study and study.open and study.open.id == trial and study.open.agent == agent:
+        if study and study.open and study.open.wire == trial and study.open.agent == agent:
             self._heard[study.name] = time.monotonic()
 
     async def reported(self, agent: str, body: Accepted | Armed | Running) -> Verdict:
@@ -234,7 +256,7 @@ class Conductor:
             trial, verdict = before.finish(Ticket(body.attempt, body.fence, agent), result)
             if verdict is Verdict.COUNTED:
                 event = Event(trial.state.value, agent, number, asdict(body))
-                study = orders.after_end(study.with_trial(trial))
+                study = orders.after_end(study.with_trial(trial), trial)
                 await self._write(Change(study, [trial], [event]))
                 self.metrics.trials.labels(trial.state.value).inc()
             elif verdict is not Verdict.REPEATED:
@@ -334,10 +356,10 @@ class Conductor:
         if now - self._heard[study.name] > study.settings.lease:
             lost = trial.expire()
             event = Event("lost", trial=trial.number, detail={"agent": trial.agent})
-            study = orders.after_end(study.with_trial(lost))
+            study = orders.after_end(study.with_trial(lost), lost)
             await self._write(Change(study, [lost], [event]))
             self.metrics.trials.labels("lost").inc()
-        elif now - self._sent.get(trial.id, 0.0) <= RESEND:
+        elif now - self._sent.get(trial.wire, 0.0) <= RESEND:
             return
         elif trial.cancelled:
             self._recall(trial)
@@ -347,8 +369,8 @@ class Conductor:
     def _recall(self, trial: Trial) -> None:
         """Ask its agent to end a trial that is cancelled; until it has."""
         if trial.cancelled and trial.state in HANDED_OUT and trial.agent:
-            self._sent[trial.id] = time.monotonic()
-            self.send(trial.agent, Cancel(trial.id, trial.attempt, trial.fence))
+            self._sent[trial.wire] = time.monotonic()
+            self.send(trial.agent, Cancel(trial.wire, trial.attempt, trial.fence))
 
     async def _hand_out(self, study: Study, trial: Trial) -> None:
         reasons = unfit(study, self.studies, self.agents)
@@ -365,9 +387,9 @@ class Conductor:
     def _assign(self, study: Study, trial: Trial) -> None:
         """Tell an agent to run a trial, unless its journal says that it knows."""
         view = self.agents.get(trial.agent or "")
-        if view is None or (trial.id, trial.attempt, trial.fence) in view.journal:
+        if view is None or (trial.wire, trial.attempt, trial.fence) in view.journal:
             return
-        self._sent[trial.id] = time.monotonic()
+        self._sent[trial.wire] = time.monotonic()
         self.send(view.name, assignment(study, trial))
 
     async def _step(self, study: Study, step: Step) -> None:
@@ -388,6 +410,7 @@ class Conductor:
 
     async def _add(self, study: Study, eta: Any, purpose: Purpose, why: Row) -> None:
         released = study.settings.gate is Gate.AUTO
-        trial = Trial(study.name, len(study.trials) + 1, tuple(eta), purpose, released=released)
+        number = len(study.trials) + 1
+        trial = Trial(study.name, number, tuple(eta), purpose, released=released, mark=study.mark)
         event = Event("requested", trial=trial.number, detail=why)
         await self._write(Change(study.with_trial(trial), [trial], [event]))

@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from pup.transfer.study import Study
+from pup.transfer.study import Study, TrialState
 from services.gateway.records import Row
 
 P = ParamSpec("P")
@@ -89,7 +89,10 @@ def search_of(study: Study, simulated: Row | None) -> Any:
     settings = study.settings
     told = study.told
     eta = np.array([t.eta for t in told], dtype=float).reshape(-1, len(settings.lower))
-    distance = np.array([_distance(t.result) for t in told], dtype=float)
+    feasible = np.array([t.state is TrialState.SUCCEEDED for t in told], dtype=bool)
+    walked = np.array([t.result.distance if t.result else None for t in told], dtype=float)
+    nowhere = min(0.0, np.min(walked[feasible], initial=0.0))  # where an infeasible eta went
+    distance = np.where(feasible, walked, nowhere)
     used = simulated if settings.warm_start else None
     return Search(
         settings.lower,
@@ -99,12 +102,8 @@ def search_of(study: Study, simulated: Row | None) -> Any:
         eta,
         distance,
         used and Simulated(np.array(used["eta"], float), np.array(used["distance"], float)),
+        feasible,
     )
-
-
-def _distance(result: Any) -> float:
-    """What the process is told: an infeasible eta went nowhere."""
-    return result.distance if result.state == "succeeded" else 0.0
 
 
 def suggest(study: Study, simulated: Row | None) -> Any:
@@ -128,7 +127,7 @@ def posterior(study: Study, simulated: Row | None) -> Row:
     from pup.transfer import optimizer
 
     search = search_of(study, simulated)
-    if len(search.distance) < 2:
+    if len(search.distance) < 2 or not search.feasible.any():
         return {"walks": len(search.distance), "best": None, "slices": []}
     best = asdict(optimizer.choose(search))
     drawn = [asdict(s) for s in optimizer.slices(search)]

@@ -160,6 +160,9 @@ class KeyRing:
         """Names of the agents that are let in, by their public keys."""
         known = {}
         for file in sorted(self.agents_folder.glob("*.key")):
+            if not is_name(file.stem):
+                log.warning("no name of an agent", extra={"file": str(file)})
+                continue
             try:
                 known[zmq.auth.load_certificate(file)[0]] = file.stem
             except (OSError, ValueError) as error:  # being copied, say; others go on

@@ -114,6 +114,9 @@ class Link:
         if files == self._files:
             return
         self.names, self._files = self.ring.agents(), files
+        for name in self.routes.keys() - set(self.names.values()):
+            del self.routes[name]
+            self.conductor.agents[name].hello = None  # it can be given no trial
         for name in self.names.values():
             self.conductor.agents.setdefault(name, AgentView(name))
 

@@ -87,7 +87,7 @@ async def one(request: Request, study: str) -> Response:
         posterior = {"best": None}
     trial, sample = found.open, None
     view = conductor.agents.get(trial.agent or "") if trial else None
-    if view and trial and view.sample and view.sample.trial == trial.id:
+    if view and trial and view.sample and view.sample.trial == trial.wire:
         sample = view.sample
     best = posterior["best"]
     name = part(request, "study.html", "study_live.html")

@@ -8,6 +8,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
@@ -89,6 +90,11 @@ def handle(app: FastAPI) -> None:
     @app.exception_handler(NoJobsError)
     async def of_jobs(request: Request, error: NoJobsError) -> JSONResponse:
         return problem(503, str(error), request)
+
+    @app.exception_handler(SQLAlchemyError)
+    async def of_database(request: Request, error: SQLAlchemyError) -> JSONResponse:
+        log.error("database failed", extra={"path": request.url.path}, exc_info=error)
+        return problem(503, "the database takes nothing now; try again", request)
 
     @app.exception_handler(InputError)
     async def of_input(request: Request, error: InputError) -> JSONResponse:

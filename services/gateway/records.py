@@ -37,12 +37,13 @@ def study_row(study: Study) -> Row:
         "fence": study.fence,
         "chosen": None if study.chosen is None else list(study.chosen),
         "settings": asdict(study.settings),
+        "mark": study.mark,
     }
 
 
 def trial_row(trial: Trial) -> Row:
-    """The row of a trial."""
-    row = {f.name: getattr(trial, f.name) for f in fields(Trial)}
+    """The row of a trial; its mark is its study's."""
+    row = {f.name: getattr(trial, f.name) for f in fields(Trial) if f.name != "mark"}
     return row | {
         "eta": list(trial.eta),
         "purpose": trial.purpose.value,
@@ -51,12 +52,13 @@ def trial_row(trial: Trial) -> Row:
     }
 
 
-def trial_of(row: Row) -> Trial:
-    """The trial of a row."""
+def trial_of(row: Row, mark: str) -> Trial:
+    """The trial of a row, of the study that has a mark."""
     result = row["result"]
     return Trial(
-        **{f.name: row[f.name] for f in fields(Trial)}
+        **{f.name: row[f.name] for f in fields(Trial) if f.name != "mark"}
         | {
+            "mark": mark,
             "eta": tuple(row["eta"]),
             "purpose": Purpose(row["purpose"]),
             "state": TrialState(row["state"]),
@@ -74,7 +76,8 @@ def study_of(row: Row, trials: list[Row]) -> Study:
         row["reason"],
         row["fence"],
         None if row["chosen"] is None else tuple(row["chosen"]),
-        tuple(sorted((trial_of(t) for t in trials), key=lambda t: t.number)),
+        tuple(sorted((trial_of(t, row["mark"]) for t in trials), key=lambda t: t.number)),
+        row["mark"],
     )
 
 

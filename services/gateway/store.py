@@ -85,6 +85,7 @@ class Store:
             self.engine = sa.create_engine(url)
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _pragmas)
+                sa.event.listen(self.engine, "begin", lambda c: c.exec_driver_sql("BEGIN"))
             with self.engine.begin() as connection:
                 _migrate(connection)
                 tables = sa.MetaData()
@@ -250,7 +251,11 @@ class Store:
 
 
 def _pragmas(connection: Any, _: Any) -> None:
-    """A journal that readers do not wait for, and commits that outlive a power cut."""
+    """A journal that readers do not wait for, and commits that outlive a power cut.
+
+    Python's own transactions begin after a table was made: a kill would leave half a migration.
+    """
+    connection.isolation_level = None
     cursor = connection.cursor()
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
         cursor.execute(f"PRAGMA {pragma}")

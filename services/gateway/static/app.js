@@ -1,6 +1,7 @@
 "use strict";
 // The page is whole without this; it brings what changes, and sends what buttons want.
 
+const SILENCE = 20000; // ms without a sign of life, which comes every 15 s
 const live = document.getElementById("live");
 const said = document.getElementById("said");
 const away = document.getElementById("away");
@@ -14,9 +15,13 @@ async function refresh() {
 if (live) {
   const events = new EventSource(live.dataset.events);
   let seen = null, busy = false, again = false;
-  events.onopen = () => { away.hidden = true; };
+  let heard = Date.now();
+  setInterval(() => { if (Date.now() - heard > SILENCE) away.hidden = false; }, 1000);
+  events.addEventListener("alive", () => { heard = Date.now(); away.hidden = true; });
+  events.onopen = () => { heard = Date.now(); away.hidden = true; };
   events.onerror = () => { away.hidden = false; };
   events.onmessage = async (event) => {
+    heard = Date.now();
     away.hidden = true;
     if (event.data === seen) return;
     seen = event.data;
@@ -25,6 +30,8 @@ if (live) {
     try { do { again = false; await refresh(); } while (again); } catch { away.hidden = false; } finally { busy = false; }
   };
 }
+
+const UNSURE = "No answer from the gateway: it may or may not have been done. Look at the robot, and at what the page says of it.";
 
 function key() {
   return Array.from(crypto.getRandomValues(new Uint8Array(16)), (b) => b.toString(16).padStart(2, "0")).join("");
@@ -40,10 +47,10 @@ document.addEventListener("click", async (event) => {
     const headers = { "Idempotency-Key": key() };
     if (button.dataset.body) headers["Content-Type"] = "application/json";
     const answer = await fetch(button.dataset.post, { method: "POST", headers, body: button.dataset.body || "" });
-    if (!answer.ok) throw new Error((await answer.json()).detail);
+    if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).detail || UNSURE);
     if (live) await refresh();
   } catch (error) {
-    said.textContent = error instanceof TypeError ? "The gateway does not answer: nothing was done." : error.message;
+    said.textContent = error instanceof TypeError ? UNSURE : error.message;
     said.hidden = false;
   } finally {
     button.disabled = false;
