@@ -90,9 +90,11 @@ class Gateway:
         while True:
             try:
                 answer = self.http.request(method, path, **options)
-                if answer.status_code < 500 or _is_problem(answer):
+                later = "Retry-After" in answer.headers
+                if not later and (answer.status_code < 500 or _is_problem(answer)):
                     break
-                why = f"it answers {answer.status_code}"
+                self.met = self.met or later
+                why = _detail(answer) if later else f"it answers {answer.status_code}"
             except httpx.HTTPError as error:
                 why = str(error) or type(error).__name__
             if not self.met or time.monotonic() - began > PATIENCE:

@@ -1,7 +1,10 @@
 """What an operator orders holds: while an agent is away, and for two robots that are alike."""
 
 import shutil
+import sqlite3
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import pytest
 
@@ -10,12 +13,14 @@ pytest.importorskip("botorch")
 
 import fake_agent
 import gateways
+import httpx
 import zmq
 import zmq.auth
 from test_gateway import until
 
 from pup.wire import AgentState, Cancel, Heartbeat, Hello, Message, Policy, encode
 from services.gateway.keys import KeyRing
+from services.transfer import Gateway
 
 STUDY = {
     "robot": "darwin_op2",
@@ -123,6 +128,35 @@ def test_a_stop_is_sent_each_time_and_until_it_is_obeyed(service):
         assert answer.status_code == 409 and "not said that it stopped" in answer.text
         agent.deaf = False
         until(lambda: agent.state is AgentState.STOPPED, 10)
+
+
+def test_a_stop_does_not_wait_for_the_database_and_a_program_does(service):
+    """Another program holds it for longer than SQLite waits."""
+    keys = service.agent_keys("locked")
+    walk = fake_agent.walks(lambda eta: 0.5)
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk) as agent:
+        until(lambda: any(a["name"] == "locked" and a["state"] for a in _agents(http)))
+        with (
+            closing(sqlite3.connect(service.data / "gateway.db", isolation_level=None)) as other,
+            ThreadPoolExecutor(2) as threads,
+        ):
+            other.execute("BEGIN IMMEDIATE")
+            program = Gateway(service.url, service.tokens["operator"], lambda _: None)
+            study = STUDY | {"name": "patient", "agent": "locked", "gate": "operator"}
+            made = threads.submit(program.post, "/v1/studies", study)
+            body = {"reason": "smoke"}
+            stopped = threads.submit(http.post, "/v1/agents/locked:stop", json=body)
+            until(lambda: agent.state is AgentState.STOPPED, 2)
+            answer = httpx.post(
+                f"{service.url}/v1/studies",
+                json=study | {"name": "impatient"},
+                headers=http.headers,
+                timeout=60,
+            )
+            assert answer.status_code == 503 and answer.headers["Retry-After"] == "1"
+            other.execute("ROLLBACK")
+            assert made.result(30)["name"] == "patient"
+            assert stopped.result(30).status_code in (202, 503)
 
 
 def test_a_study_made_anew_does_not_get_the_walks_of_an_old_one(service):

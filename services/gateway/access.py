@@ -94,7 +94,8 @@ class IdempotentRoute(APIRoute):
             locks: dict[tuple[str, str], asyncio.Lock] = request.app.state.locks
             mine = (key, user.name)
             if mine in locks:
-                raise HTTPException(409, "a request with this Idempotency-Key is under way")
+                told = "a request with this Idempotency-Key is under way"
+                raise HTTPException(409, told, {"Retry-After": "1"})
             locks[mine] = asyncio.Lock()
             try:
                 if before := await store.answer(key, user.name):

@@ -94,7 +94,8 @@ def handle(app: FastAPI) -> None:
     @app.exception_handler(SQLAlchemyError)
     async def of_database(request: Request, error: SQLAlchemyError) -> JSONResponse:
         log.error("database failed", extra={"path": request.url.path}, exc_info=error)
-        return problem(503, "the database takes nothing now; try again", request)
+        told = "the database takes nothing now; try again"
+        return problem(503, told, request, **{"Retry-After": "1"})
 
     @app.exception_handler(InputError)
     async def of_input(request: Request, error: InputError) -> JSONResponse:
