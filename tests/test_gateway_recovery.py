@@ -18,7 +18,7 @@ pytest.importorskip("botorch")
 import fake_agent
 import gateways
 
-from pup.transfer.study import Gate, StudySettings
+from pup.transfer.study import Gate, Study, StudySettings
 from pup.wire import (
     Accepted,
     AgentState,
@@ -34,6 +34,7 @@ from pup.wire import (
 from services.gateway.agents import AgentView
 from services.gateway.conductor import Conductor
 from services.gateway.metrics import Metrics
+from services.gateway.posteriors import NOTHING, Posteriors
 from services.gateway.store import Change, ReplacedError, Store
 
 POLICY = "a" * 64
@@ -246,6 +247,28 @@ def test_a_study_that_cannot_go_on_says_so_and_goes_on_when_it_can(tmp_path):
             await asyncio.sleep(0.01)
         assert "failed" not in conductor.waits_for(conductor.studies["s"])
         store.close()
+
+    asyncio.run(asyncio.wait_for(live(), 20))
+
+
+def test_a_page_does_not_wait_for_a_slow_process_and_many_pages_ask_for_one():
+    async def live():
+        asked, told, ready = [], [], asyncio.Event()
+
+        class Slow:
+            async def run(self, act, *args):
+                asked.append(act)
+                await ready.wait()
+                return {"walks": 9, "best": None, "slices": []}
+
+        made, study = Posteriors(Slow(), told.append), Study("s", SETTINGS)
+        assert await made.soon(study, None, 0.05) == NOTHING
+        waiting = [asyncio.create_task(made.of(study, None)) for _ in range(3)]
+        await asyncio.sleep(0)
+        ready.set()
+        assert [row["walks"] for row in await asyncio.gather(*waiting)] == [9, 9, 9]
+        assert len(asked) == 1 and told == ["s"]
+        assert (await made.soon(study, None, 0.05))["walks"] == 9
 
     asyncio.run(asyncio.wait_for(live(), 20))
 

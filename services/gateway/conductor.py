@@ -39,6 +39,7 @@ from services.gateway import fits
 from services.gateway.agents import AgentView
 from services.gateway.assignment import assignment, place_of, unfit, waits_for
 from services.gateway.metrics import Metrics
+from services.gateway.posteriors import Posteriors
 from services.gateway.records import Row
 from services.gateway.store import Change, Event, ReplacedError, Store
 
@@ -82,6 +83,7 @@ class Conductor:
 
     def __init__(self, store: Store, fitted: fits.Fits, metrics: Metrics) -> None:
         self.store, self.fits, self.metrics = store, fitted, metrics
+        self.posteriors = Posteriors(fitted, self.notify)
         self.studies: dict[str, Study] = {}
         self.simulated: dict[str, Row | None] = {}
         self.agents: dict[str, AgentView] = {}
@@ -91,7 +93,6 @@ class Conductor:
         self._locks: dict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._heard: dict[str, float] = {}
         self._sent: dict[str, float] = {}
-        self._posteriors: dict[str, tuple[str, Row]] = {}
         self._changed: dict[str, asyncio.Event] = defaultdict(asyncio.Event)
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._trouble: dict[str, str] = {}
@@ -265,15 +266,12 @@ class Conductor:
         self._go_on(name)
         return verdict
 
-    async def posterior(self, name: str) -> Row:
-        """The Gaussian process of a study; computed once for the same walks."""
+    async def posterior(self, name: str, seconds: float | None = None) -> Row:
+        """The Gaussian process of a study; that of fewer walks where this takes too long."""
         study = self.study(name)
-        key = f"{len(study.told)}/{[(t.number, t.attempt) for t in study.told]}"
-        kept = self._posteriors.get(name)
-        if kept is None or kept[0] != key:
-            made = await self.fits.run(fits.posterior, study, self.simulated[name])
-            kept = self._posteriors[name] = (key, made)
-        return kept[1]
+        if seconds is None:
+            return await self.posteriors.of(study, self.simulated[name])
+        return await self.posteriors.soon(study, self.simulated[name], seconds)
 
     async def wait(self, name: str, revision: int, seconds: float) -> int:
         """Wait until a study, or with an empty name an agent, changed since a revision."""

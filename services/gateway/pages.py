@@ -15,6 +15,7 @@ from services.gateway.artefacts import ways
 from services.gateway.conductor import Conductor
 from services.gateway.html import login, page, part
 from services.gateway.keys import Tokens
+from services.gateway.posteriors import NOTHING
 from services.gateway.records import study_document, trial_document
 
 log = logging.getLogger(__name__)
@@ -23,6 +24,8 @@ STATIC = Path(__file__).parent / "static"
 YEAR = 365 * 86400
 FORM_LIMIT = 1024
 """Of a form, bytes."""
+PATIENCE = 1.0
+"""For the Gaussian process: the gate must be shown soon, s."""
 SHOWN = 60
 """Numbers of an agent's health on its card."""
 JOBS, ARTIFACTS, LOG = 100, 100, 6000
@@ -81,10 +84,10 @@ async def one(request: Request, study: str) -> Response:
     conductor: Conductor = request.app.state.conductor
     found = conductor.study(study)
     try:
-        posterior = await conductor.posterior(study)
+        posterior = await conductor.posterior(study, PATIENCE)
     except Exception as error:  # whoever holds the gate needs the page all the same
         log.error("no posterior", extra={"study": study}, exc_info=error)
-        posterior = {"best": None}
+        posterior = NOTHING
     trial, sample = found.open, None
     view = conductor.agents.get(trial.agent or "") if trial else None
     if view and trial and view.sample and view.sample.trial == trial.wire:
