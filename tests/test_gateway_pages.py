@@ -91,6 +91,22 @@ def test_a_viewer_has_no_buttons_and_a_stop_stops(open_page, service):
         assert agent.state == "stopped"
 
 
+def test_a_robot_that_falls_silent_is_shown_so(open_page, service):
+    """Though nothing comes from it any more that could tell the page to change."""
+    keys = service.agent_keys("page-4")
+    asked = gateways.STUDY | {"name": "silent", "agent": "page-4", "trials": 1, "initial": 1}
+    with service.client() as http, fake_agent.FakeAgent(*keys, service.link, lambda _: None):
+        http.post("/v1/studies", json=asked)
+        page, robots = open_page(), open_page()
+        page.goto("/studies/silent")
+        page.get_by_text("running").first.wait_for()
+        robots.goto("/agents")
+        robots.locator("section", has_text="page-4").get_by_text("enabled").wait_for()
+    page.get_by_text("which was not heard for").wait_for()
+    robots.locator("section", has_text="page-4").get_by_text("away").wait_for()
+    pages.shot(page, "silent")
+
+
 def test_names_are_text_and_nothing_else(open_page, service):
     """What others say ends up on pages as text."""
     keys = service.agent_keys("page-3")

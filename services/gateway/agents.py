@@ -42,7 +42,12 @@ class AgentView:
     @property
     def present(self) -> bool:
         """Whether it was heard of lately."""
-        return time.monotonic() - self.heard < SILENCE
+        return self.silent < SILENCE
+
+    @property
+    def silent(self) -> float:
+        """Since the last message, s."""
+        return time.monotonic() - self.heard
 
     def greet(self, hello: Hello) -> None:
         """A new connection, perhaps of a new program: what was known of the old one is void."""
@@ -91,7 +96,7 @@ class AgentView:
     def document(self) -> dict[str, Any]:
         """As the REST interface tells it."""
         hello = self.hello
-        silent = time.monotonic() - self.heard
+        silent = self.silent
         return {
             "name": self.name,
             "robot": hello.robot if hello else None,

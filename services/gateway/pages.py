@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from pathlib import Path
 from urllib.parse import parse_qs
 
@@ -93,6 +94,7 @@ async def one(request: Request, study: str) -> Response:
     if view and trial and view.sample and view.sample.trial == trial.wire:
         sample = view.sample
     best = posterior["best"]
+    silent = f"for {view.silent:.0f} s" if view and math.isfinite(view.silent) else "yet"
     name = part(request, "study.html", "study_live.html")
     return page(
         name,
@@ -102,6 +104,7 @@ async def one(request: Request, study: str) -> Response:
         trials=[trial_document(t) for t in reversed(found.trials)],
         trial=trial and trial_document(trial),
         sample=sample,
+        silent=silent if view and not view.present else "",
         best=best,
         progress=Markup(drawing.progress(found)),
         slices=[Markup(s) for s in drawing.slices(posterior, found)] if best else [],

@@ -5,6 +5,7 @@ gateway takes a new epoch; a gateway that finds a newer one was replaced and may
 """
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,8 @@ from services.gateway.records import Row, job_of, job_row, study_of, study_row, 
 
 T = TypeVar("T")
 ANSWERS_KEPT = 7 * 86400.0  # s
+TRIED = 1.0
+"""Between two tries whether the database takes writes, s: anybody may ask."""
 
 
 class ReplacedError(RuntimeError):
@@ -81,6 +84,7 @@ class Store:
 
     def __init__(self, url: str) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="store")
+        self._tried = (-math.inf, False)
         try:
             self.engine = sa.create_engine(url)
             if self.engine.dialect.name == "sqlite":
@@ -172,12 +176,16 @@ class Store:
         await self.run(keep)
 
     async def writable(self) -> bool:
-        """Whether the database takes writes of this gateway."""
-        try:
-            await self.run(self._check)
-        except (SQLAlchemyError, ReplacedError):
-            return False
-        return True
+        """Whether the database takes writes of this gateway; tried once a second at most."""
+        at, told = self._tried
+        if time.monotonic() - at > TRIED:
+            try:
+                await self.run(self._check)
+                told = True
+            except (SQLAlchemyError, ReplacedError):
+                told = False
+            self._tried = time.monotonic(), told
+        return told
 
     def close(self) -> None:
         """Let go of the database."""
