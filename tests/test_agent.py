@@ -54,11 +54,13 @@ def assign(policy: Path, trial: str = "t", horizon: float = 0.4) -> Assign:
 
 
 @contextmanager
-def at_work(folder: Path, speed: float = 0.0, more: str = "") -> Iterator[tuple[Lab, Gateway]]:
+def at_work(
+    folder: Path, speed: float = 0.0, more: str = "", protocol: int = 1
+) -> Iterator[tuple[Lab, Gateway]]:
     """A lab whose agent is linked to a gateway and has its robot enabled."""
     gateway = Gateway(folder / "keys")
     try:
-        with lab(folder, speed=speed, more=gateway.config + more) as made:
+        with lab(folder, speed, protocol, more=gateway.config + more) as made:
             made.start()
             wait(lambda: bool(gateway.of(Hello)), 20, made.log)
             made.say("enable")
