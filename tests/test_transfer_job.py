@@ -121,7 +121,7 @@ def test_attended_a_study_goes_on_without_results_but_not_for_ever(
     good, cut_off = agent.walk, {(2, 1), (3, 1), (3, 2), (3, 3)}
 
     def walk(body):
-        number = int(body.trial.rpartition("/")[2])
+        number = int(body.trial.rpartition("/")[2].partition(".")[0])
         if cut_off and (number, body.attempt) not in cut_off:
             return good(body)
         return Finished(body.trial, body.attempt, body.fence, Outcome.ABORTED, reason="cut off")
