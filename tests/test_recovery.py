@@ -33,6 +33,7 @@ def assert_recovered(bounds, truth):
     assert not missed, {n: (truth[n], bounds.document()["parameters"]) for n in missed}
 
 
+@pytest.mark.slow
 def test_servo_gains_of_a_leg_are_recovered(tmp_path: Path) -> None:
     """Suspended steps tell stiffness, damping and torque limit of each group."""
     space = robot_space(RobotDescription.load("darwin_leg"), "pd")
