@@ -8,6 +8,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,24 +158,35 @@ def recording_of(
       source: `hardware` or `simulation`.
       notes: free text.
     """
-    n = len(joints)
-    table = dict(zip(row_names(joints), rows.T, strict=True))
-    main = {"time", *(f"{kind}/{joint}" for kind in KINDS[:2] for joint in joints)}
-    extras = {k: v for k, v in table.items() if k not in main and not np.isnan(v).all()}
     return Recording(
         id=recording_id(assign),
         robot=robot,
         motion="walk",
         support="ground",
         source=source,
-        joints=tuple(joints),
-        time=rows[:, 0],
-        target=rows[:, 1 : 1 + n],
-        position=rows[:, 1 + n : 1 + 2 * n],
-        extras=extras,
+        **columns_of(rows, joints),
         repeat_of=assign.repeat_of,
         notes=notes,
     )
+
+
+def columns_of(rows: Array, joints: Sequence[str]) -> dict[str, Any]:
+    """What rows say of joints, time, targets, positions and the rest, as a Recording takes it.
+
+    Args:
+      rows: shape (n_ticks, n_columns); see `row_names`.
+      joints: their names.
+    """
+    n = len(joints)
+    table = dict(zip(row_names(joints), rows.T, strict=True))
+    main = {"time", *(f"{kind}/{joint}" for kind in KINDS[:2] for joint in joints)}
+    return {
+        "joints": tuple(joints),
+        "time": rows[:, 0],
+        "target": rows[:, 1 : 1 + n],
+        "position": rows[:, 1 + n : 1 + 2 * n],
+        "extras": {k: v for k, v in table.items() if k not in main and not np.isnan(v).all()},
+    }
 
 
 def _fresh(senses: Senses) -> Array:

@@ -35,7 +35,7 @@ from hardware_agent.config import (
 )
 from hardware_agent.control import say
 from hardware_agent.rollout import Row, columns_of
-from hardware_agent.senses import Trip
+from hardware_agent.senses import Senses, Trip
 from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
@@ -169,14 +169,14 @@ class Player:
                 self._tick(pose + share * (goal - pose), PERIOD, name)
             pose = goal
         self._stay(pose, REST, name)
-        rows = self._rows(motion, name)
+        rows = np.array([row.values for row in self._rows(motion, name)])
         return Recording(
             id=name,
             robot=self.robot.name,
             motion=motion.motion,
             support=motion.support,
             source="simulation",
-            **columns_of(rows),
+            **columns_of(rows, self.robot.joint_names),
             repeat_of=repeat_of,
             notes=f"Virtual robot of seed {self.seed}, through its bus; noise of {draw}.",
         )
@@ -198,13 +198,13 @@ class Player:
 
     def _enable(self, name: str) -> None:
         self.body.guard.reset()
-        refused = self.body.enable(self.body.sense(self._time, walking=False))
+        refused = self.body.enable(self._sense())
         if refused is not None:
             raise InputError(f"recording {name}: {refused}")
 
     def _tick(self, target: Array, gap: float, name: str) -> Row:
         """Read, ask the rules, send; then the gap passes."""
-        senses = self.body.sense(self._time, walking=False)
+        senses = self._sense()
         if gap != self._gap:
             self._say(cmd="period", time=gap)
             self._gap = gap
@@ -216,6 +216,9 @@ class Player:
             raise InputError(f"recording {name}: stopped by {applied}")
         self._time = round(self._time + gap, 6)
         return Row(senses.time, senses, applied)
+
+    def _sense(self) -> Senses:
+        return self.body.sense(self._time, walking=False, alone=False)
 
     def _say(self, **command: Any) -> None:
         say(self.doors.side, command)
