@@ -26,6 +26,7 @@ from hardware_agent.journal import Journal
 from pup.files import sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
+from pup.wire import without_mark
 from services.laboratory import AGENT, Laboratory
 from services.transfer import Gateway
 
@@ -202,7 +203,7 @@ def verdict(
     wanted: int,
 ) -> dict[str, Any]:
     """What both histories say of trials lost, executed twice and told twice."""
-    journal = [e | {"trial": _id(e["trial"])} for e in journal if "trial" in e]
+    journal = [e | {"trial": without_mark(e["trial"])} for e in journal if "trial" in e]
     moved = Counter((e["trial"], e["attempt"]) for e in journal if e["event"] == "running")
     ended = {(e["trial"], e["attempt"]): e["finished"] for e in journal if e["event"] == "finished"}
     succeeded = Counter(e["trial"] for e in history if e["kind"] == "succeeded")
@@ -221,12 +222,6 @@ def verdict(
         "told_but_not_walked": len(results.keys() - walked.keys()),
         "distances_agree": agree == len(results),
     }
-
-
-def _id(wire: str) -> str:
-    """What people call a trial that has its study's mark on the wire."""
-    study, _, number = wire.rpartition("/")
-    return f"{study}/{number.partition('.')[0]}"
 
 
 def main() -> None:

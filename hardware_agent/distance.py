@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from hardware_agent.config import DistanceSettings
 from hardware_agent.control import Unreachable, say
 from pup.errors import InputError
-from pup.wire import Assign
+from pup.wire import Assign, without_mark
 
 AXES = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "sideways": (0.0, -1.0)}
 """Directions of a walk in the frame of the start: x forward, y left."""
@@ -160,6 +160,4 @@ class Virtual:
 
 def _number(trial: str) -> int:
     """A number that a trial's name stands for, whichever attempt and study of this name it is."""
-    study, _, number = trial.rpartition("/")
-    name = f"{study}/{number.partition('.')[0]}" if study else trial
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
+    return int.from_bytes(hashlib.sha256(without_mark(trial).encode()).digest()[:8], "big")

@@ -337,3 +337,9 @@ def decode(data: bytes) -> Message:
         id=read(str, told.get("id"), "id"),
         time=read(float, told.get("time"), "time"),
     )
+
+
+def without_mark(trial: str) -> str:
+    """What people call a trial that is named on the wire: `study/7` of `study/7.9f3a12c4`."""
+    study, slash, number = trial.rpartition("/")
+    return f"{study}{slash}{number.partition('.')[0]}" if slash else trial

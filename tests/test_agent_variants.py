@@ -7,7 +7,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from agents import DARWIN, Lab, bundle, lab, standing, wait
 from test_agent import assign, at_work
+from test_agent_holds import enabled, holding
 
 from hardware_agent.config import ImuSettings
 from hardware_agent.imu import Bno055, imu_of
@@ -29,20 +29,10 @@ from hardware_agent.virtual.plant import Hold
 from hardware_agent.virtual.robot import VirtualRobot
 
 
-def holding(made: Lab) -> int:
-    return int(made.side(cmd="bus")["holding"])
-
-
-def enabled(made: Lab) -> None:
+def taken_up(made: Lab) -> None:
     """Somebody picks the robot up and has it hold."""
     made.side(cmd="reset")
-
-    def tried() -> bool:
-        with suppress(InputError):  # an answer may come late on a busy machine
-            made.say("enable")
-        return bool(made.health()["state"] == "enabled")
-
-    wait(tried, 20, made.log)
+    enabled(made)
 
 
 def recorded(folder: Path, ended: Finished) -> Recording:
@@ -74,13 +64,13 @@ def test_whatever_ends_it_servos_of_protocol_2_let_go(tmp_path: Path) -> None:
         wait(lambda: holding(made) == 0, 2, made.log)
         wait(lambda: bool(gateway.of(Finished)), 20, made.log)
         assert gateway.of(Finished)[0].state is Outcome.ABORTED
-        enabled(made)
+        taken_up(made)
         made.side(cmd="fault", kind="dead_servo", id=14)
         assert made.until("fault")["reason"].startswith("stale servo: ")
         wait(lambda: holding(made) <= 1, 2, made.log)
         made.side(cmd="fault", kind="dead_servo", id=14, off=True)
         wait(lambda: holding(made) == 0, 10, made.log)
-        enabled(made)
+        taken_up(made)
         assert holding(made) == 20
         made.kill()
         wait(lambda: holding(made) == 0, 2, made.log)
@@ -131,7 +121,7 @@ class Wires:
 @pytest.fixture
 def wires(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Wires]]:
     module = ModuleType("smbus2")
-    module.SMBus = Wires  # type: ignore[attr-defined]
+    monkeypatch.setattr(module, "SMBus", Wires, raising=False)
     monkeypatch.setitem(sys.modules, "smbus2", module)
     Wires.robot, Wires.cut = VirtualRobot(DARWIN, 1), False
     Wires.robot.board.write(24, b"\x01")

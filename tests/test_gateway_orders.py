@@ -15,21 +15,14 @@ import fake_agent
 import gateways
 import httpx
 import zmq
-import zmq.auth
 from test_gateway import until
+from test_gateway_link import dealer
 
 from pup.wire import AgentState, Cancel, Heartbeat, Hello, Message, Policy, encode
 from services.gateway.keys import KeyRing
 from services.transfer import Gateway
 
-STUDY = {
-    "robot": "darwin_op2",
-    "policy": fake_agent.POLICY,
-    "gate": "auto",
-    "trials": 1,
-    "initial": 1,
-    "repeats": 0,
-}
+STUDY = gateways.STUDY | {"trials": 1, "initial": 1, "repeats": 0}
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +84,9 @@ def test_a_stop_that_nobody_hears_is_told_so(service):
 
 def test_a_key_that_was_copied_to_a_second_robot_moves_one(service):
     """The second is not heard while the first is there, and at once when it has gone."""
-    secret, gateway = service.agent_keys("copied")
+    keys = service.agent_keys("copied")
     with zmq.Context() as context, service.client() as http:
-        first, second = (_dealer(context, service, secret, gateway) for _ in range(2))
+        first, second = (_connected(context, service, keys) for _ in range(2))
         first.send(encode(Message(Hello("copied", "darwin_op2", "first", (_policy(),)))))
         assert first.poll(10_000)
         second.send(encode(Message(Hello("copied", "darwin_op2", "second", (_policy(),)))))
@@ -203,10 +196,8 @@ def _policy():
     return Policy("walk", fake_agent.POLICY)
 
 
-def _dealer(context, service, secret, gateway):
-    socket = context.socket(zmq.DEALER)
-    socket.curve_publickey, socket.curve_secretkey = zmq.auth.load_certificate(secret)
-    socket.curve_serverkey = zmq.auth.load_certificate(gateway)[0]
+def _connected(context, service, keys):
+    socket = dealer(context, service, keys)
     socket.connect(service.link)
     return socket
 

@@ -33,7 +33,7 @@ def as_server(*command):
 
 @pytest.fixture(scope="module")
 def url():
-    if SERVER is None:
+    if SERVER is None:  # a program of the system, which pip cannot bring; SQLite is tested always
         pytest.skip("no PostgreSQL server is installed: apt-get install postgresql")
     folder = Path(tempfile.mkdtemp(prefix="pg"))  # a socket's path must be short
     if os.geteuid() == 0:

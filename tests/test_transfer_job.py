@@ -17,7 +17,7 @@ from commandline import pup
 
 from pup.errors import InputError
 from pup.policy.bundle import read_bundle
-from pup.wire import Finished, Outcome
+from pup.wire import Finished, Outcome, without_mark
 
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
@@ -121,7 +121,7 @@ def test_attended_a_study_goes_on_without_results_but_not_for_ever(
     good, cut_off = agent.walk, {(2, 1), (3, 1), (3, 2), (3, 3)}
 
     def walk(body):
-        number = int(body.trial.rpartition("/")[2].partition(".")[0])
+        number = int(without_mark(body.trial).rpartition("/")[2])
         if cut_off and (number, body.attempt) not in cut_off:
             return good(body)
         return Finished(body.trial, body.attempt, body.fence, Outcome.ABORTED, reason="cut off")

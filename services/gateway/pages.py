@@ -94,7 +94,9 @@ async def one(request: Request, study: str) -> Response:
     if view and trial and view.sample and view.sample.trial == trial.wire:
         sample = view.sample
     best = posterior["best"]
-    silent = f"for {view.silent:.0f} s" if view and math.isfinite(view.silent) else "yet"
+    silent = ""
+    if view and not view.present:
+        silent = f"for {view.silent:.0f} s" if math.isfinite(view.silent) else "yet"
     name = part(request, "study.html", "study_live.html")
     return page(
         name,
@@ -104,7 +106,7 @@ async def one(request: Request, study: str) -> Response:
         trials=[trial_document(t) for t in reversed(found.trials)],
         trial=trial and trial_document(trial),
         sample=sample,
-        silent=silent if view and not view.present else "",
+        silent=silent,
         best=best,
         progress=Markup(drawing.progress(found)),
         slices=[Markup(s) for s in drawing.slices(posterior, found)] if best else [],
