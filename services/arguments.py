@@ -68,6 +68,14 @@ def _run(verb: argparse.ArgumentParser) -> None:
         comparison=False,
         start="the robot's own identified.json, without one the values of robot.toml",
     )
+    verb.add_argument(
+        "--effects",
+        type=number(0, 16),
+        default=3,
+        metavar="N",
+        help="missing effects that recordings and first walks are searched for, to do it all again "
+        "with the robot as it was found to be; default: 3, 0 leaves that out",
+    )
     later = verb.add_argument_group("what follows, for robots with a gait")
     for name, limits, default, told in (
         ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 300000"),

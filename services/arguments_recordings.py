@@ -118,6 +118,14 @@ def diagnose(verb: argparse.ArgumentParser) -> None:
         help="also fit the paper's NN-PD and a residual network to the same recordings and judge "
         "all by motions left out; takes longer and needs PyTorch (the extra `learn`)",
     )
+    verb.add_argument(
+        "--effects",
+        type=number(1, 16),
+        default=8,
+        metavar="N",
+        help="missing effects that are looked for at most, one after the other, minutes for each "
+        "where a robot has many joints; default: 8",
+    )
     seed(verb)
     place(verb)
 

@@ -67,6 +67,7 @@ def run_diagnosis(
     seed: int = 0,
     report: bool = True,
     rivals: bool = False,
+    effects: int = 8,
 ) -> dict[str, Any]:
     """Diagnose recordings and write the files; run again, it goes on where it was stopped.
 
@@ -79,6 +80,7 @@ def run_diagnosis(
       seed: of everything random.
       report: whether to write `report.html` too.
       rivals: whether to fit and judge rivals too, which needs PyTorch.
+      effects: that are looked for at most.
 
     Returns:
       The document of `diagnosis.json`: that of the contract, and how many `seconds` it took from
@@ -90,7 +92,13 @@ def run_diagnosis(
     others = None
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads, a verdict must not
         found = diagnose(
-            robot, recordings, lambda m: watch.around(run(m)), where.lanes, progress, seed
+            robot,
+            recordings,
+            lambda m: watch.around(run(m)),
+            where.lanes,
+            progress,
+            seed,
+            effects,
         )
         if rivals:
             progress("rivals", 0.97)

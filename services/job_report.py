@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from pup.files import write_atomic
 from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, as_svg, drawing_style, new_figure
 from pup.sysid.html import Column, Drawing, Html, figure, page, table, tag
+from services.diagnosis import CORRECTED
 from services.stages import Done
 
 TITLES = {
@@ -20,6 +21,8 @@ TITLES = {
     "train": "Training",
     "walk": "Walk in simulation",
     "transfer": "Walks of the virtual robot",
+    "diagnosis": "What the simulator leaves out",
+    CORRECTED: "The same with the robot as it was found to be",
 }
 
 
@@ -42,6 +45,18 @@ class Job:
     left_out: Mapping[str, str]
 
 
+def title(stage: str) -> str:
+    """What a stage is called; one of the second half says so."""
+    half, kind = _parts(stage)
+    return f"{TITLES[kind]}, corrected robot" if half else TITLES[kind]
+
+
+def _parts(stage: str) -> tuple[str, str]:
+    """The half's folder with a slash, empty for the first, and what is done in it."""
+    half, _, kind = stage.rpartition("-")
+    return (f"{half}/" if half else "", kind)
+
+
 def write_report(job: Job) -> None:
     """Write `report.html`, whole or not at all."""
     with drawing_style():
@@ -60,8 +75,9 @@ def found(documents: Mapping[str, Any]) -> dict[str, str]:
         "train": _training_words,
         "walk": _walk_words,
         "transfer": _transfer_words,
+        "diagnosis": _diagnosis_words,
     }
-    return {name: words[name](document) for name, document in documents.items()}
+    return {name: words[_parts(name)[1]](document) for name, document in documents.items()}
 
 
 def _bounds_words(told: Mapping[str, Any]) -> str:
@@ -83,8 +99,8 @@ def _training_words(told: Mapping[str, Any]) -> str:
     words = f"{told['steps']:,} steps, {told['direction']}, "
     if start is None:
         return words + "from scratch"
-    words += "further from the policy that comes with the robot"
-    return words + (", which was trained on other bounds" if start["other_bounds"] else "")
+    words += "further from a policy"
+    return words + (" that was trained on other bounds" if start["other_bounds"] else "")
 
 
 def _walk_words(told: Mapping[str, Any]) -> str:
@@ -102,6 +118,21 @@ def _transfer_words(told: Mapping[str, Any]) -> str:
     )
 
 
+def _diagnosis_words(told: Mapping[str, Any]) -> str:
+    if told["verdict"] != "mismatch":
+        return f"verdict {told['verdict']}" + (f": {told['reason']}" if told["reason"] else "")
+    named = ", ".join(_finding(f) for f in told["findings"])
+    if told["held_out"] is None:
+        return named
+    before, after = (1000 * told["held_out"][f"rmse_{when}"] for when in ("before", "after"))
+    unit = "m" + told["position_unit"]
+    return f"{named}; motions left out {before:.3g} {unit} before, {after:.3g} {unit} after"
+
+
+def _finding(finding: Mapping[str, Any]) -> str:
+    return f"{finding['effect'].replace('_', ' ')} ({finding['probability']:.0%})"
+
+
 def spread(told: Mapping[str, Any]) -> str:
     """Mean and standard deviation of distances, in words."""
     if told["mean"] is None:
@@ -115,7 +146,8 @@ def _content(job: Job) -> Iterator[Html]:
     yield tag(
         "p",
         "Recordings, bounds, a policy within them, and the eta with which a robot of concealed "
-        "physics walks furthest. Distances of the virtual robot are results in simulation too.",
+        "physics walks furthest; what the simulator leaves out, and the same with that in it. "
+        "Distances of the virtual robot are results in simulation too.",
         class_="lead",
     )
     yield tag("dl", *_facts(job), class_="facts")
@@ -126,25 +158,30 @@ def _content(job: Job) -> Iterator[Html]:
         "train": _train,
         "walk": _walk,
         "transfer": _transfer,
+        "diagnosis": _diagnosis,
     }
     for name, document in job.documents.items():
-        told = sections[name](job, document)
-        yield tag("section", tag("h2", TITLES[name]), *told, id=name)
+        half, kind = _parts(name)
+        told = sections[kind](job, document, half)
+        yield tag("section", tag("h2", title(name)), *told, id=name)
     yield tag("section", tag("h2", "Artefacts"), *_artefacts(job), id="artefacts")
 
 
 def _facts(job: Job) -> Iterator[Html]:
     told = job.documents
-    replayed = told["replay"]
-    before, after = (told["presysid"]["loss"]["train"][k] for k in ("rmse_before", "rmse"))
-    unit = replayed["unit"]
-    yield _fact("Joint error", f"{after:.3g} {unit}", f"before the fit: {before:.3g} {unit}")
-    if "walk" in told:
-        median = told["walk"]["distance_median"]
-        yield _fact("Walk in simulation", f"{median:.2f} m", "median over the bounds")
-    if "transfer" in told:
-        yield _fact("Virtual robot, chosen eta", spread(told["transfer"]["chosen"]), "")
-        yield _fact("Virtual robot, eta fitted", spread(told["transfer"]["fitted"]), "no trials")
+    unit = told["replay"]["unit"]
+    for half, of in (("", ""), (f"{CORRECTED}-", ", corrected")):
+        if (replayed := told.get(f"{half}replay")) is None:
+            continue
+        before = told["presysid"]["loss"]["train"]["rmse_before"]
+        more = f"before the fit: {before:.3g} {unit}"
+        yield _fact(f"Joint error{of}", f"{replayed['rmse']:.3g} {unit}", more)
+        if walked := told.get(f"{half}walk"):
+            median = walked["distance_median"]
+            yield _fact(f"Walk in simulation{of}", f"{median:.2f} m", "median over the bounds")
+        if tried := told.get(f"{half}transfer"):
+            yield _fact(f"Virtual robot, chosen eta{of}", spread(tried["chosen"]), "")
+            yield _fact(f"Virtual robot, eta fitted{of}", spread(tried["fitted"]), "no trials")
 
 
 def _fact(name: str, value: str, more: str) -> Html:
@@ -153,13 +190,13 @@ def _fact(name: str, value: str, more: str) -> Html:
 
 def _stages(job: Job) -> Iterator[Html]:
     words = found(job.documents)
-    rows = [(TITLES[n], f"{job.done[n].seconds:,.0f}", words[n]) for n in job.documents]
+    rows = [(title(n), f"{job.done[n].seconds:,.0f}", words[n]) for n in job.documents]
     rows += [(TITLES[name], "", f"left out: {why}") for name, why in job.left_out.items()]
     columns = [Column("Stage"), Column("Took [s]", "number"), Column("Found", "long")]
     yield table("Stages, with the time since each was last interrupted", columns, rows)
 
 
-def _presysid(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+def _presysid(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
     columns = [Column("Parameter"), Column("Unit", "words")]
     columns += [Column(t, "number") for t in ("Nominal", "Lower", "Upper")]
     rows = [
@@ -168,38 +205,40 @@ def _presysid(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
     ]
     vague = ["" if p["identified"] else "unknown" for p in told["parameters"]]
     yield table("Bounds (grey: not identified by these recordings)", columns, rows, vague)
-    yield tag("p", "More: ", tag("a", "the report of pre-sysID", href="presysid/report.html"), ".")
+    yield tag(
+        "p", "More: ", tag("a", "the report of pre-sysID", href=f"{half}presysid/report.html"), "."
+    )
 
 
-def _replay(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+def _replay(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
     columns = [Column("Recording", "long"), Column(f"RMSE [{told['unit']}]", "number")]
     rows = [(name, f"{error:.3g}") for name, error in told["per_recording"].items()]
     yield table("Joint error of the fitted model", columns, rows)
 
 
-def _train(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+def _train(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
     yield tag("p", f"{_training_words(told)}.")
     yield _picture(
-        job.out / "train" / "curve.png",
+        job.out / f"{half}train" / "curve.png",
         f"Curves of the training over {told['steps']:,} steps.",
         "While still exploring: distance, time before the fall, reward and divergence over steps.",
     )
 
 
-def _walk(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+def _walk(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
     shown = told["shown"]
     end = "fell" if shown["fell"] else "stayed up"
     yield tag("p", f"{_walk_words(told)}.")
     yield _picture(
-        job.out / "walk" / "gait.png",
+        job.out / f"{half}walk" / "gait.png",
         f"Stick figures of the walk, {shown['distance']:.2f} m in {shown['time']:.1f} s.",
         f"With the fitted parameters: {shown['distance']:.2f} m in {shown['time']:.1f} s, {end}.",
     )
     video = Path(told["video"]).name
-    yield tag("p", "The walk as a ", tag("a", "video", href=f"walk/{video}"), ".")
+    yield tag("p", "The walk as a ", tag("a", "video", href=f"{half}walk/{video}"), ".")
 
 
-def _transfer(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
+def _transfer(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
     yield tag(
         "p",
         f"Walks of at most {told['horizon']:g} s, through gateway, agent and servo bus, of the "
@@ -229,6 +268,26 @@ def _transfer(job: Job, told: Mapping[str, Any]) -> Iterator[Html]:
         for w in told["walks"]
     ]
     yield table("All walks", columns, rows)
+
+
+def _diagnosis(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
+    yield tag("p", f"{_diagnosis_words(told)}.")
+    if told["findings"]:
+        columns = [Column("Effect", "words"), Column("Place", "long"), Column("Regime", "words")]
+        columns += [Column("Probability", "number"), Column("Law", "long")]
+        rows = [
+            (
+                finding["effect"].replace("_", " "),
+                f"{finding['place']['kind']} {', '.join(finding['place']['names'])}".strip(),
+                finding["regime"],
+                f"{finding['probability']:.0%}",
+                finding["law"],
+            )
+            for finding in told["findings"]
+        ]
+        yield table("What was found, by how much it explains", columns, rows)
+    link = tag("a", "the report of the diagnosis", href=f"{half}diagnosis/report.html")
+    yield tag("p", "More: ", link, ".")
 
 
 _COMPARED = {"chosen": "chosen", "of the fitted parameters": "fitted"}

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,65 +11,49 @@ from pup.errors import InputError
 from pup.files import sha256
 from pup.policy.bundle import CARD, GRAPH, WEIGHTS, read_bundle
 from pup.recording import Recording, load_recordings
+from pup.recording_cuts import cut
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
-from services.presysid import Options, Progress, identify
+from services.diagnosis import CORRECTED
+from services.mission import STEPS, TRIALS, Means, Mission
+from services.presysid import Options, identify
 from services.replay import replay
 from services.stages import Journal, Stage, content
-from workers.fits import Runner
 
-SHIPPED = "recordings"
-"""Folder of a built-in robot with recordings of our own, from virtual robot 0."""
 POLICIES = "policies"
 """Folder of a built-in robot with a bundle for each direction."""
 DIRECTION = "forward"
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
-STEPS = 300_000
-"""Of the training unless told otherwise: a minute and a half at 3,700 a second."""
-TRIALS = 25
-"""Walks until eta is chosen (paper)."""
 FURTHER_RATE = 2e-4
 """Adam's, where a policy that walks is trained further: the usual one would undo its gait."""
 EPISODES = 50
+DIAGNOSIS = "diagnosis"
+"""Stage, and folder, between the two halves of a job."""
+ROLLOUTS, ROLLOUT_SECONDS = 2, 2.0
+"""Walks of the first trials that are diagnosed beside the recordings, from the start of each."""
 
 
 @dataclass(frozen=True)
-class Mission:
-    """What a job does.
+class Half:
+    """One half of a job: what is done with a robot as described, or as it was found to be.
 
     Attributes:
-      presysid: budget of its fits.
-      steps: of the training; 0 leaves it out; None for STEPS where the robot has a gait.
-      trials: walks until eta is chosen; 0 leaves them out; None for TRIALS where the robot has a
-        gait and servos.
-      repeats: walks of the chosen eta and of the fitted one.
+      robot: that is simulated.
+      options: of its pre-sysID.
+      name: of the half, before those of its stages; empty for the first.
     """
 
-    presysid: Options
-    steps: int | None = None
-    trials: int | None = None
-    repeats: int = 5
+    robot: RobotDescription
+    options: Options
+    name: str = ""
 
+    def stage(self, name: str) -> str:
+        """What the half calls a stage."""
+        return f"{self.name}-{name}" if self.name else name
 
-@dataclass(frozen=True)
-class Means:
-    """Where a job works and whom it tells.
-
-    Attributes:
-      fits: opens where fits run.
-      ray: connects to the Ray of the training, and gives the cores there are.
-      progress: opens what is told how far fits are.
-      trained: opens what is told how far the training is.
-      told: hears how far the trials are.
-      threads: cores for what runs in this process.
-    """
-
-    fits: Callable[[], AbstractContextManager[Runner]]
-    ray: Callable[[], AbstractContextManager[int]]
-    progress: Callable[[], AbstractContextManager[Progress]]
-    trained: Callable[[], AbstractContextManager[Callable[[dict[str, Any], int], None]]]
-    told: Callable[[str], None]
-    threads: int
+    def at(self, name: str) -> str:
+        """Where the half has a file or folder, relative to the job's folder."""
+        return f"{self.name}/{name}" if self.name else name
 
 
 def run(
@@ -109,99 +92,159 @@ class _Job:
         means: Means,
     ) -> None:
         self.robot, self.recordings, self.out, self.means = robot, recordings, out, means
-        self.options, self.repeats = mission.presysid, mission.repeats
+        self.mission, self.first = mission, Half(robot, mission.presysid)
         self.shipped = robot.folder / POLICIES / DIRECTION
         self.left_out: dict[str, str] = {}
         self.steps = self._wanted("train", mission.steps, STEPS, self._no_training())
         self.trials = self._wanted("transfer", mission.trials, TRIALS, self._no_trials())
         self.journal = Journal(out)
+        self.documents: dict[str, Any] = {}
 
     def run(self) -> dict[str, Any]:
-        documents: dict[str, Any] = {}
-        for make in (self._presysid, self._replay, self._train, self._walk, self._transfer):
-            stage = make()
-            if stage is not None:
-                self.journal.once(stage)
-                documents[stage.name] = content(self.out, stage.files[0])
-        took = {name: self.journal.done(name).seconds for name in documents}
-        self.journal.once(self._report(documents))
-        return documents | {"left_out": self.left_out, "took": took}
+        self._do_half(self.first)
+        if second := self._corrected():
+            self._do_half(second)
+        took = {name: self.journal.done(name).seconds for name in self.documents}
+        self.journal.once(self._report(self.documents))
+        return self.documents | {"left_out": self.left_out, "took": took}
 
-    def _presysid(self) -> Stage:
+    def _do_half(self, half: Half) -> None:
+        for make in (self._presysid, self._replay, self._train, self._walk, self._transfer):
+            if stage := make(half):
+                self._do(stage)
+
+    def _do(self, stage: Stage) -> None:
+        self.journal.once(stage)
+        self.documents[stage.name] = content(self.out, stage.files[0])
+
+    def _corrected(self) -> Half | None:
+        """The second half of the job, if the diagnosis found what is to be corrected."""
+        if not self.mission.effects:
+            self.left_out[DIAGNOSIS] = "as told"
+            return None
+        self._do(self._diagnosis())
+        if not self.documents[DIAGNOSIS]["findings"]:
+            self.left_out[CORRECTED] = "the diagnosis found nothing to correct"
+            return None
+        robot = RobotDescription.load(str(self.out / DIAGNOSIS / CORRECTED))
+        options = replace(self.mission.presysid, start=self.out / BOUNDS, compare=False)
+        return Half(robot, options, CORRECTED)
+
+    def _presysid(self, half: Half) -> Stage:
         def work() -> None:
             means = self.means
             with means.fits() as fits, means.progress() as progress:
-                folder = self.out / "presysid"
+                folder = self.out / half.at("presysid")
                 recordings, threads = self.recordings, means.threads
-                identify(self.robot, recordings, self.options, folder, fits, progress, threads)
+                identify(half.robot, recordings, half.options, folder, fits, progress, threads)
 
-        files = (BOUNDS, "presysid/report.html")
-        return Stage("presysid", self._measured() | _told(self.options.told()), files, work)
+        files = (half.at(BOUNDS), half.at("presysid/report.html"))
+        inputs = self._measured(half) | _told(half.options.told())
+        return Stage(half.stage("presysid"), inputs, files, work)
 
-    def _replay(self) -> Stage:
+    def _replay(self, half: Half) -> Stage:
         def work() -> None:
-            bounds, threads = self.out / BOUNDS, self.means.threads
-            replay(self.robot, self.recordings, bounds, self.out / "replay", threads)
+            bounds, out = self.out / half.at(BOUNDS), self.out / half.at("replay")
+            replay(half.robot, self.recordings, bounds, out, self.means.threads)
 
-        inputs = self._measured() | self._hash(BOUNDS)
-        return Stage("replay", inputs, ("replay/replay.json",), work)
+        inputs = self._measured(half) | self._hash(half.at(BOUNDS))
+        return Stage(half.stage("replay"), inputs, (half.at("replay/replay.json"),), work)
 
-    def _train(self) -> Stage | None:
+    def _train(self, half: Half) -> Stage | None:
         if not self.steps:
             return None
         from services.training import Options as Training
         from services.training import train
         from workers.learner import Learning
 
-        start = self._start()
-        options = Training(steps=self.steps, seed=self.options.seed, start=start)
+        start = self._start(half)
+        options = Training(steps=self.steps, seed=self.mission.presysid.seed, start=start)
         if start is not None:
             options = replace(options, learning=Learning(rate=FURTHER_RATE))
 
         def work() -> None:
             with self.means.trained() as told:
-                bounds, out = self.out / BOUNDS, self.out / "train"
-                train(self.robot, bounds, options, out, self.means.ray, told)
+                bounds, out = self.out / half.at(BOUNDS), self.out / half.at("train")
+                train(half.robot, bounds, options, out, self.means.ray, told)
 
         begun = {} if start is None else {"policy that it starts from": sha256(start / CARD)}
-        inputs = self._described() | self._hash(BOUNDS) | begun
+        inputs = _described(half) | self._hash(half.at(BOUNDS)) | begun
         inputs |= _told(asdict(replace(options, start=None)))
-        bundle = [f"{POLICY}/{name}" for name in (CARD, WEIGHTS, GRAPH)]
-        files = ("train/training.json", *bundle, "train/curve.png")
-        return Stage("train", inputs, files, work, folder="train", remade=True)
+        bundle = [half.at(f"{POLICY}/{name}") for name in (CARD, WEIGHTS, GRAPH)]
+        files = (half.at("train/training.json"), *bundle, half.at("train/curve.png"))
+        return self._alone(half, "train", inputs, files, work, remade=True)
 
-    def _walk(self) -> Stage | None:
+    def _walk(self, half: Half) -> Stage | None:
         if not self.steps:
             return None
         from services.walk import Shown, walk
 
-        shown = Shown(
-            self.out / POLICY, self.out / BOUNDS, episodes=EPISODES, seed=self.options.seed
-        )
+        policy, bounds = self.out / half.at(POLICY), self.out / half.at(BOUNDS)
+        shown = Shown(policy, bounds, episodes=EPISODES, seed=self.mission.presysid.seed)
 
         def work() -> None:
-            walk(self.robot, shown, self.out / "walk", self.means.threads)
+            walk(half.robot, shown, self.out / half.at("walk"), self.means.threads)
 
-        inputs = self._described() | self._hash(BOUNDS, f"{POLICY}/{CARD}")
+        inputs = _described(half) | self._hash(half.at(BOUNDS), half.at(f"{POLICY}/{CARD}"))
         inputs |= {"seed": str(shown.seed)}
-        files = ("walk/replay.json", "walk/gait.png", "walk/walk.mp4", "walk/walk.gif")
-        return Stage("walk", inputs, files, work, folder="walk")
+        names = "replay.json", "gait.png", "walk.mp4", "walk.gif"
+        return self._alone(half, "walk", inputs, [half.at(f"walk/{n}") for n in names], work)
 
-    def _transfer(self) -> Stage | None:
-        if not self.trials:
+    def _transfer(self, half: Half) -> Stage | None:
+        if not self.trials or (half.name and not self.steps):  # the same policy would walk again
             return None
         from services.trials import Budget, try_out
 
-        budget = Budget(self.trials, self.repeats, self.options.seed)
-        policy = self.out / POLICY if self.steps else self.shipped
+        budget = Budget(self.trials, self.mission.repeats, self.mission.presysid.seed)
+        policy = self.out / half.at(POLICY) if self.steps else self.shipped
+        bounds, out = self.out / half.at(BOUNDS), self.out / half.at("transfer")
 
         def work() -> None:
-            bounds, out = self.out / BOUNDS, self.out / "transfer"
             try_out(self.robot, policy, bounds, budget, out, self.means.told)
 
-        used = {"policy": sha256(policy / CARD)} | self._described() | self._hash(BOUNDS)
-        files = ("transfer/transfer.json", "transfer/study.json")
-        return Stage("transfer", used | _told(asdict(budget)), files, work, folder="transfer")
+        used = {"policy": sha256(policy / CARD)} | _described(self.first)
+        used |= self._hash(half.at(BOUNDS)) | _told(asdict(budget))
+        names = "transfer.json", "study.json"
+        files = [half.at(f"transfer/{name}") for name in names]
+        return self._alone(half, "transfer", used, files, work)
+
+    def _diagnosis(self) -> Stage:
+        from services.diagnosis import DIAGNOSIS as TOLD
+        from services.diagnosis import run_diagnosis
+
+        walks, seed, effects = self._walks(), self.mission.presysid.seed, self.mission.effects
+
+        def work() -> None:
+            recordings, out = [*self.recordings, *walks], self.out / DIAGNOSIS
+            with self.means.replays() as where, self.means.looked() as looked:
+                run_diagnosis(self.robot, recordings, out, where, looked, seed, effects=effects)
+
+        files = [f"{DIAGNOSIS}/{n}" for n in (TOLD, "report.html", f"{CORRECTED}/robot.toml")]
+        inputs = self._measured(self.first) | {f"recording {r.id}": r.digest for r in walks}
+        inputs |= {"seed": str(seed), "effects": str(effects)}
+        return Stage(DIAGNOSIS, inputs, tuple(files), work, DIAGNOSIS)
+
+    def _walks(self) -> list[Recording]:
+        """How the first walks of the trials began, by names that outlive an interruption."""
+        if not self.trials:
+            return []
+        from services.trials import recorded
+
+        files = recorded(self.out / "transfer")[:ROLLOUTS]
+        walked = [replace(walk, notes="") for walk in load_recordings(files, self.robot)]
+        return [cut(walk, 0.0, ROLLOUT_SECONDS, f"walk_{i}") for i, walk in enumerate(walked, 1)]
+
+    def _alone(
+        self,
+        half: Half,
+        name: str,
+        inputs: Mapping[str, str],
+        files: Sequence[str],
+        work: Callable[[], None],
+        remade: bool = False,
+    ) -> Stage:
+        """A stage that has a folder to itself."""
+        return Stage(half.stage(name), inputs, tuple(files), work, half.at(name), remade)
 
     def _report(self, documents: Mapping[str, Any]) -> Stage:
         from services.job_report import Job, write_report
@@ -239,38 +282,29 @@ class _Job:
             return "the service is not installed (the extra `service`)"
         return ""
 
-    def _start(self) -> Path | None:
-        """The shipped policy, if there is one of the parameters that were found."""
-        if not (self.shipped / CARD).is_file():
+    def _start(self, half: Half) -> Path | None:
+        """The policy to train further, if it is of the parameters that were found.
+
+        It is the one that comes with the robot, and for a corrected robot that of the first half.
+        """
+        policy = self.out / POLICY if half.name else self.shipped
+        if not (policy / CARD).is_file():
             return None
-        card, _ = read_bundle(self.shipped, self.robot)
-        same = card.parameters == read_bounds(self.out / BOUNDS, self.robot).names
-        return self.shipped if same and card.method == "pup" else None
+        card, _ = read_bundle(policy, self.robot)
+        same = card.parameters == read_bounds(self.out / half.at(BOUNDS), half.robot).names
+        return policy if same and card.method == "pup" else None
 
-    def _described(self) -> dict[str, str]:
-        return {f"robot {self.robot.name}": self.robot.digest}
-
-    def _measured(self) -> dict[str, str]:
-        return self._described() | {f"recording {r.id}": r.digest for r in self.recordings}
+    def _measured(self, half: Half) -> dict[str, str]:
+        return _described(half) | {f"recording {r.id}": r.digest for r in self.recordings}
 
     def _hash(self, *names: str) -> dict[str, str]:
         return {name: sha256(self.out / name) for name in names}
 
 
+def _described(half: Half) -> dict[str, str]:
+    return {f"robot {half.robot.name}": half.robot.digest}
+
+
 def _told(options: Mapping[str, Any]) -> dict[str, str]:
     """Options as the journal has them."""
     return {"options": json.dumps(options, sort_keys=True, default=str)}
-
-
-def default_recordings(robot: RobotDescription) -> tuple[Recording, ...]:
-    """The recordings that come with a robot.
-
-    Raises:
-      InputError: none come with it.
-    """
-    folder = robot.folder / SHIPPED
-    if not folder.is_dir():
-        raise InputError(
-            f"robot {robot.name!r} comes without recordings; give some with --recordings DIR"
-        )
-    return load_recordings([folder], robot)

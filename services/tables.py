@@ -40,7 +40,7 @@ def stages_table(documents: dict[str, Any]) -> None:
     Args:
       documents: of the stages by name, with `took` and `left_out`.
     """
-    from services.job_report import TITLES, found
+    from services.job_report import TITLES, found, title
 
     console = Console(highlight=False)
     table = Table(title="stages", title_justify="left")
@@ -49,7 +49,7 @@ def stages_table(documents: dict[str, Any]) -> None:
     table.add_column("found", overflow="fold")
     took = documents["took"]
     for name, words in found({name: documents[name] for name in took}).items():
-        table.add_row(TITLES[name], f"{took[name]:.0f}", words)
+        table.add_row(title(name), f"{took[name]:.0f}", words)
     for name, why in documents["left_out"].items():
         table.add_row(TITLES[name], "", f"left out: {why}")
     console.print(table)

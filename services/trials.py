@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.files import sha256, write_json
+from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import FittedBounds, read_bounds
@@ -144,6 +144,18 @@ def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]
         raise InputError(f"the policy is of a model with {unknown[0]!r}, which the fitted has not")
     mu = bounds.space.nominal[[names.index(name) for name in card.parameters]]
     return policy.project(card.scale.unit(mu))
+
+
+def recorded(folder: Path) -> list[Path]:
+    """Recordings of a study's walks of the search that ended by themselves, in their order.
+
+    Args:
+      folder: with the study's `study.json`.
+    """
+    trials = read_json(folder / "study.json")["trials"]
+    searched = [t for t in trials if t["purpose"] in ("initial", "search")]
+    names = [t["recording"] for t in searched if t["state"] == "succeeded" and t["recording"]]
+    return [folder / "agent" / "recordings" / f"{name}.parquet" for name in names]
 
 
 def attend(gateway: Gateway, study: dict[str, Any]) -> None:

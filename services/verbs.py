@@ -22,8 +22,9 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
     _quiet_torch()
     from pup.recording import load_recordings
     from pup.sysid.accuracy import JointUnits
-    from services.pipeline import Means, Mission, default_recordings, run
-    from services.progress import reporter, trained
+    from services.mission import Means, Mission, default_recordings
+    from services.pipeline import run
+    from services.progress import reporter, stages, trained
 
     robot = RobotDescription.load(options.robot)
     given = options.recordings
@@ -31,18 +32,20 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
     budget = _budget(options, robot)
     if budget.start is None and _identified(robot) == budget.actuator:
         budget = replace(budget, start=robot.identified_path)
-    mission = Mission(budget, options.train_steps, options.trials, options.repeats)
+    mission = Mission(budget, options.train_steps, options.trials, options.repeats, options.effects)
     means = Means(
         lambda: places.fits(options),
+        lambda: places.replays(options),
         lambda: places.training(options),
         reporter,
+        stages,
         trained,
         _tell,
         places.cores(options),
     )
     with _folder(options.out) as out:
-        stages = run(robot, recordings, mission, out, means)
-    return stages | {
+        done = run(robot, recordings, mission, out, means)
+    return done | {
         "report": str(out / "report.html"),
         "unit": JointUnits.of(robot, recordings).position,
     }
@@ -181,7 +184,14 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
     recordings = load_recordings(options.recordings, robot)
     with _folder(options.out) as out, places.replays(options) as where, stages() as progress:
         return run_diagnosis(
-            robot, recordings, out, where, progress, options.seed, rivals=options.rivals
+            robot,
+            recordings,
+            out,
+            where,
+            progress,
+            options.seed,
+            rivals=options.rivals,
+            effects=options.effects,
         )
 
 

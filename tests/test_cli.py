@@ -229,12 +229,13 @@ def test_run_keeps_finished_stages_and_does_again_what_changed(
 ) -> None:
     out = tmp_path / "out"
     command = ("run", "--recordings", bench_recordings, "--robot", "servo_bench", "--out", out)
+    command += ("--effects", 0)
     first = pup(*command, *TINY, "--json")
     assert first.code == 0, first.err
     assert_plain_progress(first)
     told = first.json()
     assert told.keys() == {"presysid", "replay", "report", "unit", "took", "left_out"}
-    assert told["left_out"].keys() == {"train", "transfer"}
+    assert told["left_out"].keys() == {"train", "transfer", "diagnosis"}
     check(out)
     made = files(out)
     times = {name: (out / name).stat().st_mtime_ns for name in made}
@@ -263,7 +264,7 @@ def test_run_does_again_what_another_recording_changes(
     bench_recordings: Path, tmp_path: Path
 ) -> None:
     recordings = shutil.copytree(bench_recordings, tmp_path / "rec")
-    command = ("run", "--recordings", recordings, "--robot", "servo_bench")
+    command = ("run", "--recordings", recordings, "--robot", "servo_bench", "--effects", 0)
     assert pup(*command, "--out", tmp_path / "out", *TINY).code == 0
     (recordings / "step_0.3.parquet").unlink()
     done = pup(*command, "--out", tmp_path / "out", *TINY)

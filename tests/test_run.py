@@ -28,7 +28,7 @@ TINY = (
     *("--local", "--cores", 1, "--population", 4, "--generations", 1, "--subsets", 2),
     *("--subset-generations", 1, "--fixed-network", "--no-comparison"),
 )
-FEW = (*TINY, "--trials", 2, "--repeats", 1)
+FEW = (*TINY, "--trials", 2, "--repeats", 1, "--effects", 0)
 PATIENCE = 300.0
 
 
@@ -131,7 +131,7 @@ def test_killed_in_a_walk_it_leaves_nothing_and_repeats_no_other(
 def check_result(told: dict[str, Any], out: Path) -> None:
     """What is printed, the journal and the report tell the same."""
     assert told["transfer"] == json.loads((out / "transfer" / "transfer.json").read_text())
-    assert told["left_out"] == {"train": "as told"}
+    assert told["left_out"] == {"train": "as told", "diagnosis": "as told"}
     assert told["took"].keys() == {"presysid", "replay", "transfer"}
     page = Page(out / "report.html")
     assert not {"script", "link", "iframe"} & {name for name, _ in page.elements}

@@ -113,7 +113,8 @@ def test_what_a_robot_cannot_do_is_refused_before_anything_is_done(
 def test_a_shipped_policy_is_started_from_where_the_bounds_are_of_its_parameters(
     tmp_path: Path,
 ) -> None:
-    from services.pipeline import Means, Mission, _Job
+    from services.mission import Means, Mission
+    from services.pipeline import Half, _Job
     from services.presysid import Options
 
     folder = shutil.copytree(DARWIN.folder, tmp_path / "darwin_op2")
@@ -125,8 +126,11 @@ def test_a_shipped_policy_is_started_from_where_the_bounds_are_of_its_parameters
 
     def start() -> Path | None:
         robot = RobotDescription.load(folder)
-        means = Means(None, None, None, None, print, 1)  # type: ignore[arg-type]  # no stage is run
-        return _Job(robot, (), Mission(Options(), 1000, 0), out, means)._start()
+        nothing = [None] * 6  # no stage is run
+        means = Means(*nothing, print, 1)  # type: ignore[arg-type]
+        return _Job(robot, (), Mission(Options(), 1000, 0), out, means)._start(
+            Half(robot, Options())
+        )
 
     assert start() is None
     shipped = agents.bundle(folder / POLICIES / "forward", parameters=names)

@@ -98,6 +98,7 @@ def diagnose(
     lanes: int,
     progress: Progress,
     seed: int = 0,
+    effects: int = 8,
 ) -> Diagnosis:
     """Locate and name what the simulator of a robot leaves out.
 
@@ -108,6 +109,7 @@ def diagnose(
       lanes: how many run at once.
       progress: told the stage and the share of all that is done.
       seed: of everything random.
+      effects: that are looked for at most; each may act at several places.
     """
     rng = np.random.default_rng(seed)
     measured = Measured.of(robot, pieces(recordings))
@@ -139,14 +141,14 @@ def diagnose(
 
     if poor:
         return told("undetermined", poor)
-    first = _first_look(nominal, replays, rng, progress)
+    first = _first_look(nominal, replays, rng, progress, effects)
     if first is not None:
         nominal = replace(nominal, certificate=first[0].certificate)
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
-    done = search(replays, nominal, rng, progress, first[1] if first else None)
+    done = search(replays, nominal, rng, progress, first[1] if first else None, effects)
     if done is not None and nominal.noise.source == "assumed":
-        nominal, done = _weighed(nominal, done, replays, rng, progress, first)
+        nominal, done = _weighed(nominal, done, replays, rng, progress, first, effects)
     if done is None:
         return told("undetermined", "the motions would not show any effect of the library")
     model, rounds, selector = done.model, done.rounds, done.selector
@@ -193,6 +195,7 @@ def _weighed(
     rng: np.random.Generator,
     progress: Progress,
     first: tuple[Nominal, Search] | None,
+    effects: int,
 ) -> tuple[Nominal, Search | None]:
     """The search done again where what it leaves is not the noise that it was weighed by.
 
@@ -212,7 +215,8 @@ def _weighed(
     certificate = nominal.certificate
     left = certificate.left * fit.chi2 / nominal.fit.chi2
     nominal = Nominal(fit, noise, replace(certificate, left=left))
-    return nominal, search(replays, nominal, rng, progress, first[1] if first else None)
+    known = first[1] if first else None
+    return nominal, search(replays, nominal, rng, progress, known, effects)
 
 
 def _matters(
@@ -229,7 +233,11 @@ def _matters(
 
 
 def _first_look(
-    nominal: Nominal, replays: Replays, rng: np.random.Generator, progress: Progress
+    nominal: Nominal,
+    replays: Replays,
+    rng: np.random.Generator,
+    progress: Progress,
+    effects: int,
 ) -> tuple[Nominal, Search] | None:
     """What is missing in the motions that the nominal model can follow, where it loses others."""
     kept = followed(nominal, replays)
@@ -237,7 +245,8 @@ def _first_look(
         return None
     some = replays.narrowed(kept)
     fitted = fit_nominal(some, assumed_noise(some.measured), rng)
-    found = search(some, fitted, rng, progress) if fitted.certificate.holds else None
+    holds = fitted.certificate.holds
+    found = search(some, fitted, rng, progress, most=effects) if holds else None
     replays.simulated += some.simulated
     return None if found is None else (fitted, found)
 

@@ -57,6 +57,7 @@ def search(
     rng: np.random.Generator,
     progress: Callable[[str, float], None],
     first: Search | None = None,
+    most: int = 8,
 ) -> Search | None:
     """Look for effects; None where the motions would show none.
 
@@ -66,6 +67,7 @@ def search(
       rng: draws noise.
       progress: told the stage and the share of all that is done.
       first: what was found in some of the recordings.
+      most: effects that are looked for.
     """
     progress("score test", 0.3)
     base = nominal.fit if first is None else _carried(first, replays, nominal)
@@ -73,7 +75,7 @@ def search(
     if not found:
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
-    selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base)
+    selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base, most)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
     start = selector.nominal

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.evidence import Projector, Score, Trace, scores
+from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
 from pup.diagnosis.fitting import (
     Coordinate,
     Fit,
@@ -37,10 +37,13 @@ HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
+LEADING = 400
+"""Hypotheses that are simulated again around a model that has an effect more: where there are more,
+those that looked most like its errors before."""
 SWAPS, RIVALS = 2, 2
 """Effects that may be exchanged, and rivals that each may be exchanged for."""
-MOST, PLACES = 8, 16
-"""Effects that are looked for, and places that all of them together may act at."""
+PLACES = 16
+"""Places that all effects together may act at."""
 KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""
 FORM = 0.03
@@ -117,6 +120,7 @@ class Selector:
       enough: surprise that chance does not reach.
       nominal: the nominal fit, with its Jacobian.
       base: the fit to start from, where some effects are known already.
+      most: effects that are looked for.
     """
 
     def __init__(
@@ -127,11 +131,12 @@ class Selector:
         enough: float,
         nominal: Fit,
         base: Fit | None = None,
+        most: int = 8,
     ) -> None:
         self.replays = replays
         self.noise = noise
         self.found, self.base = tuple(found), base or nominal
-        self.enough = enough
+        self.enough, self.most = enough, most
         self.folds = folds(replays)
         self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
         self.nominal = self.predicting(self.model((), nominal))
@@ -155,7 +160,7 @@ class Selector:
 
     def _added(self, model: Model, rounds: list[Round]) -> Model:
         """The model with effects added as long as one holds; notes the rounds."""
-        while len(model.hypotheses) < PLACES and len(_effects(model.hypotheses)) < MOST:
+        while len(model.hypotheses) < PLACES and len(_effects(model.hypotheses)) < self.most:
             chosen = self._round(model)
             if chosen is None:
                 break
@@ -229,10 +234,24 @@ class Selector:
         known = {h.key for h in model.hypotheses}
         if model.fit is not self.base:
             rest = [h for h in hypotheses(self.replays.measured) if h.key not in known]
-            self.found = tuple(traces(rest, model.fit, self.replays, self.noise))
+            self.found = self._traced_anew(model.fit, rest)
             self.base = model.fit
             self._seen |= {t.hypothesis.key: t.basis.shape[1] for t in self.found}
         return [t for t in self.found if t.hypothesis.key not in known]
+
+    def _traced_anew(self, fit: Fit, rest: Sequence[Hypothesis]) -> tuple[Trace, ...]:
+        """Traces around a fit; where there are very many, those of the hopeless as they were."""
+        assert fit.jacobian is not None and fit.residual is not None
+        project = Projector(fit.jacobian)
+        kept = {h.key for h in rest}
+        old = [t for t in self.found if t.hypothesis.key in kept]
+        again = [traced(t.hypothesis, t.whole, project) for t in old]
+        ranking = scores([t for t in again if t is not None], project(fit.residual[:, None])[:, 0])
+        place = {s.trace.hypothesis.key: rank for rank, s in enumerate(ranking)}
+        leading = sorted(rest, key=lambda h: place.get(h.key, len(place)))[:LEADING]
+        left = {h.key for h in leading}
+        new = traces(leading, fit, self.replays, self.noise)
+        return (*new, *(s.trace for s in ranking if s.trace.hypothesis.key not in left))
 
     def blur(self, model: Model, share: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pup.files import read_json
 from pup.policy.bundle import NumpyPolicy, read_bundle, write_bundle
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
@@ -81,18 +80,6 @@ def conditioned(policy: Path, folder: Path, robot: RobotDescription) -> Path:
     card = replace(card, parameters=(NOTHING,), parameter_lower=(0.0,), parameter_upper=(1.0,))
     write_bundle(folder, card, seen)
     return folder
-
-
-def recorded(folder: Path) -> list[Path]:
-    """Recordings of a study's walks of the search that ended by themselves, in their order.
-
-    Args:
-      folder: that `walk` wrote to.
-    """
-    trials = read_json(folder / "study.json")["trials"]
-    searched = [t for t in trials if t["purpose"] in ("initial", "search")]
-    names = [t["recording"] for t in searched if t["state"] == "succeeded" and t["recording"]]
-    return [folder / "agent" / "recordings" / f"{name}.parquet" for name in names]
 
 
 def _walked(walks: list[dict[str, Any]], purpose: str) -> dict[str, list[float]]:

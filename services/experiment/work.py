@@ -193,7 +193,7 @@ def trials(task: Task) -> dict[str, Any]:
 def diagnosis(task: Task) -> dict[str, Any]:
     """What the simulator leaves out, from recordings and walks, and the corrected robot."""
     from services.diagnosis import alone, run_diagnosis
-    from services.experiment.walking import recorded
+    from services.trials import recorded
 
     recordings = list(task.recordings(tuple(task.told["motions"])))
     if "rollouts" in task.needed:

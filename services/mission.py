@@ -1,0 +1,83 @@
+"""What a whole job is asked for, and the means it has."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+from pup.errors import InputError
+from pup.recording import Recording, load_recordings
+from pup.robot import RobotDescription
+from services.diagnosis import Progress as Looked
+from services.diagnosis import Where
+from services.presysid import Options, Progress
+from workers.fits import Runner
+
+SHIPPED = "recordings"
+"""Folder of a built-in robot with recordings of our own, from virtual robot 0."""
+STEPS = 300_000
+"""Of the training unless told otherwise: a minute and a half at 3,700 a second."""
+TRIALS = 25
+"""Walks until eta is chosen (paper)."""
+EFFECTS = 3
+"""Missing effects unless told otherwise: a robot of twenty joints takes minutes for each."""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """What a job does.
+
+    Attributes:
+      presysid: budget of its fits.
+      steps: of each training; 0 leaves it out; None for STEPS where the robot has a gait.
+      trials: walks until eta is chosen; 0 leaves them out; None for TRIALS where the robot has a
+        gait and servos.
+      repeats: walks of the chosen eta and of the fitted one.
+      effects: missing ones that recordings and walks are searched for, to do all of it again with
+        the robot as it was found to be; 0 leaves that out.
+    """
+
+    presysid: Options
+    steps: int | None = None
+    trials: int | None = None
+    repeats: int = 5
+    effects: int = EFFECTS
+
+
+@dataclass(frozen=True)
+class Means:
+    """Where a job works and whom it tells.
+
+    Attributes:
+      fits: opens where fits run.
+      replays: opens where a diagnosis replays.
+      ray: connects to the Ray of the training, and gives the cores there are.
+      progress: opens what is told how far fits are.
+      looked: opens what is told how far the diagnosis is.
+      trained: opens what is told how far the training is.
+      told: hears how far the trials are.
+      threads: cores for what runs in this process.
+    """
+
+    fits: Callable[[], AbstractContextManager[Runner]]
+    replays: Callable[[], AbstractContextManager[Where]]
+    ray: Callable[[], AbstractContextManager[int]]
+    progress: Callable[[], AbstractContextManager[Progress]]
+    looked: Callable[[], AbstractContextManager[Looked]]
+    trained: Callable[[], AbstractContextManager[Callable[[dict[str, Any], int], None]]]
+    told: Callable[[str], None]
+    threads: int
+
+
+def default_recordings(robot: RobotDescription) -> tuple[Recording, ...]:
+    """The recordings that come with a robot.
+
+    Raises:
+      InputError: none come with it.
+    """
+    folder = robot.folder / SHIPPED
+    if not folder.is_dir():
+        raise InputError(
+            f"robot {robot.name!r} comes without recordings; give some with --recordings DIR"
+        )
+    return load_recordings([folder], robot)
