@@ -71,10 +71,10 @@ def _run(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--effects",
         type=number(0, 16),
-        default=3,
+        default=2,
         metavar="N",
         help="missing effects that recordings and first walks are searched for, to do it all again "
-        "with the robot as it was found to be; default: 3, 0 leaves that out",
+        "with the robot as it was found to be; default: 2, 0 leaves that out",
     )
     later = verb.add_argument_group("what follows, for robots with a gait")
     for name, limits, default, told in (

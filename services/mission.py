@@ -19,7 +19,7 @@ STEPS = 300_000
 """Of the training unless told otherwise: a minute and a half at 3,700 a second."""
 TRIALS = 25
 """Walks until eta is chosen (paper)."""
-EFFECTS = 3
+EFFECTS = 2
 """Missing effects unless told otherwise: a robot of twenty joints takes minutes for each."""
 
 

@@ -127,7 +127,14 @@ class _Job:
             self.left_out[CORRECTED] = "the diagnosis found nothing to correct"
             return None
         robot = RobotDescription.load(str(self.out / DIAGNOSIS / CORRECTED))
-        options = replace(self.mission.presysid, start=self.out / BOUNDS, compare=False)
+        first = self.mission.presysid
+        options = replace(
+            first,
+            generations=_half(first.generations),
+            subset_generations=_half(first.subset_generations),
+            start=self.out / BOUNDS,
+            compare=False,
+        )
         return Half(robot, options, CORRECTED)
 
     def _presysid(self, half: Half) -> Stage:
@@ -299,6 +306,11 @@ class _Job:
 
     def _hash(self, *names: str) -> dict[str, str]:
         return {name: sha256(self.out / name) for name in names}
+
+
+def _half(generations: int) -> int:
+    """Of a fit that begins where another one ended."""
+    return max(1, generations // 2)
 
 
 def _described(half: Half) -> dict[str, str]:
