@@ -1,4 +1,4 @@
-"""What Ray costs a fit, how two cores compare with one, and what is to be expected of 32.
+"""What Ray costs a fit, how two cores compare with one, and what is to be expected of 256.
 
 (a) The same two fits of a few recordings by the local runner on all of two cores and by Ray on two
 workers, in turn. Ray's start is told apart: it is paid once per job. Under `processor` stand the
@@ -9,9 +9,10 @@ core and of two, in turn. Beside it what the machine has to give: two processes 
 but its memory, each with a fit of its own, against one of them alone.
 
 (c) Costs measured here (candidates at once, the search's own steps, Ray's time per task), played
-through by an event simulation to 32 workers. Efficiency is the speed-up over one worker divided by
-the number of workers. What is gained when one cause at a time is taken away names the bottleneck.
-The simulation knows neither network nor memory bandwidth.
+through by an event simulation to 256 workers. Efficiency is the speed-up over one worker divided by
+the number of workers. What is gained when one cause at a time is taken away names the bottleneck,
+unless there are fewer candidates at once than workers: then that is it. The simulation knows
+neither network nor memory bandwidth. `--simulated` does this part alone.
 
 Ray gives its workers the lowest priority. Here they get the ordinary one, else what other programs
 do to the two runners would be compared.
@@ -50,9 +51,11 @@ FEW = 3
 """Recordings of the fits that are timed as a whole."""
 SUBSETS = 4
 """Fits of so many recordings that run at once, as Algorithm 1 runs those of its subsets."""
-WORKERS = (1, 2, 4, 8, 16, 32)
+WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+TOLD = 32, 256
+"""Workers at which the bottleneck is named."""
 SIZES = (1, 2, 4, 8, 16)
-SCENARIOS = ((1, 32), (1, 64), (10, 16), (50, 16))
+SCENARIOS = ((1, 32), (1, 64), (10, 16), (50, 16), (200, 16))
 """Fits at once and their population."""
 PAPER_SIZE = 5  # times the shipped recordings are as many as the paper's 60
 
@@ -60,6 +63,7 @@ PAPER_SIZE = 5  # times the shipped recordings are as many as the paper's 60
 def main() -> None:
     options = parser(__doc__, rounds=3)
     options.add_argument("--recordings", type=Path, help="of darwin_op2; default: the shipped ones")
+    options.add_argument("--simulated", action="store_true", help="part (c) alone")
     given = options.parse_args()
     os.environ.setdefault("RAY_worker_niceness", "0")
     report = Report("ray_overhead", given.json)
@@ -69,10 +73,11 @@ def main() -> None:
         recordings = tuple(load_recordings([given.recordings]))
     suspended = tuple(r for r in recordings if r.support == "suspended")
     few = suspended[:FEW]
-    report.add("against_local", _against_local(robot, few, given.rounds, report))
-    report.add("machine", _two_processes(robot, few, given.rounds, report))
-    report.add("two_against_one", _two_against_one(robot, suspended, given.rounds, report))
-    report.add("simulated", _to_32(robot, recordings, report))
+    if not given.simulated:
+        report.add("against_local", _against_local(robot, few, given.rounds, report))
+        report.add("machine", _two_processes(robot, few, given.rounds, report))
+        report.add("two_against_one", _two_against_one(robot, suspended, given.rounds, report))
+    report.add("simulated", _to_many(robot, recordings, report))
     report.finish()
 
 
@@ -216,7 +221,7 @@ class Costs:
         return self.fixed + self.candidate * candidates
 
 
-def _to_32(
+def _to_many(
     robot: RobotDescription, recordings: tuple[Recording, ...], report: Report
 ) -> list[dict[str, object]]:
     task = _task_overhead(robot, recordings[:1])
@@ -256,8 +261,16 @@ def _scenario(name: str, fits: int, population: int, costs: Costs) -> dict[str, 
         "Ray": replace(costs, task=0.0),
     }
     gains = {
-        cause: efficiency(better, WORKERS[-1]) - by_workers[WORKERS[-1]]
-        for cause, better in without.items()
+        workers: {
+            cause: efficiency(better, workers) - by_workers[workers]
+            for cause, better in without.items()
+        }
+        for workers in TOLD
+    }
+    few = {workers: fits * population / workers for workers in TOLD}
+    bottleneck = {
+        workers: "few candidates" if few[workers] < 1 else max(told, key=lambda c: told[c])
+        for workers, told in gains.items()
     }
     return {
         "recordings": name,
@@ -266,7 +279,7 @@ def _scenario(name: str, fits: int, population: int, costs: Costs) -> dict[str, 
         "costs": asdict(costs),
         "efficiency": by_workers,
         "gained_without": gains,
-        "bottleneck": max(gains, key=lambda cause: gains[cause]),
+        "bottleneck": bottleneck,
     }
 
 
@@ -274,10 +287,14 @@ def _line(row: dict[str, object]) -> str:
     efficiency, gains = row["efficiency"], row["gained_without"]
     assert isinstance(efficiency, dict) and isinstance(gains, dict)
     told = ", ".join(f"{w}: {e:.0%}" for w, e in efficiency.items())
-    causes = ", ".join(f"{cause} {gain:+.0%}" for cause, gain in gains.items())
+    causes = "; ".join(
+        f"{workers} workers, {row['bottleneck'][workers]}, without "
+        + ", ".join(f"{cause} {gain:+.0%}" for cause, gain in gain_of.items())
+        for workers, gain_of in gains.items()
+    )
     return (
         f"  {row['recordings']}, {row['fits']} fits of population {row['population']}: {told}; "
-        f"bar 70 %. Without: {causes}"
+        f"bar 70 %. {causes}"
     )
 
 

@@ -13,7 +13,6 @@ from pup.policy.bundle import CARD, GRAPH, WEIGHTS, read_bundle
 from pup.recording import Recording, load_recordings
 from pup.recording_cuts import cut
 from pup.robot import RobotDescription
-from pup.sysid.result import read_bounds
 from services.diagnosis import CORRECTED
 from services.mission import STEPS, TRIALS, Means, Mission
 from services.presysid import Options, identify
@@ -132,8 +131,10 @@ class _Job:
             first,
             generations=_half(first.generations),
             subset_generations=_half(first.subset_generations),
-            start=self.out / BOUNDS,
+            actuator="pd",  # as it was diagnosed: what was found is missing beside PD servos
             compare=False,
+            start=None,
+            near=True,
         )
         return Half(robot, options, CORRECTED)
 
@@ -290,7 +291,7 @@ class _Job:
         return ""
 
     def _start(self, half: Half) -> Path | None:
-        """The policy to train further, if it is of the parameters that were found.
+        """The policy to train further.
 
         It is the one that comes with the robot, and for a corrected robot that of the first half.
         """
@@ -298,8 +299,7 @@ class _Job:
         if not (policy / CARD).is_file():
             return None
         card, _ = read_bundle(policy, self.robot)
-        same = card.parameters == read_bounds(self.out / half.at(BOUNDS), half.robot).names
-        return policy if same and card.method == "pup" else None
+        return policy if card.method == "pup" else None
 
     def _measured(self, half: Half) -> dict[str, str]:
         return _described(half) | {f"recording {r.id}": r.digest for r in self.recordings}

@@ -54,6 +54,7 @@ class Options:
       seed: of everything random.
       start: bounds file whose fitted values stand in for those of the robot's description: fits of
         its torque law begin there, and what the recordings cannot see stays there.
+      near: whether the description's values are fitted ones, so that fits begin with small steps.
     """
 
     actuator: Actuator = "nn_pd"
@@ -67,6 +68,7 @@ class Options:
     fixed_network: bool = False
     seed: int = 0
     start: Path | None = None
+    near: bool = False
 
     def told(self) -> dict[str, Any]:
         """As files have it: a file is known by its content, wherever it lies."""
@@ -189,7 +191,8 @@ class _Job:
     def _fit_of_all(self, name: str, problem: Problem) -> Fit:
         o = self.options
         start = problem.free_space.normalise(problem.free_space.nominal)
-        sigma = NEAR_SIGMA if problem.actuator in self.known else FAR_SIGMA
+        near = problem.actuator in self.known or o.near
+        sigma = NEAR_SIGMA if near else FAR_SIGMA
         return Fit(name, problem, FitSettings(start, sigma, o.population, o.generations, o.seed))
 
     def _folds(self) -> list[tuple[int, ...]]:

@@ -61,8 +61,8 @@ class Options:
       length: control steps of each between two updates.
       learning: how the networks are moved; what follows from the rest is filled in.
       runners: processes that sample; 0 for none beside this one.
-      start: bundle whose weights are trained further, perhaps of other bounds of the same
-        parameters; None draws weights.
+      start: bundle whose weights are trained further, perhaps of other bounds or parameters;
+        None draws weights.
       track: other places that are told the curve, `wandb` and `mlflow`.
       engine: what simulates.
     """
@@ -278,10 +278,11 @@ class _Job:
         if folder is None:
             return None
         card, weights = read_bundle(folder, self.robot)
-        if card.shape != self.shape or card.parameters != self.card.parameters:
+        alike = replace(card.shape, parameters=self.shape.parameters) == self.shape
+        if card.method != self.card.method or not alike:
             raise InputError(
-                f"{folder}: a {card.method} policy of other sizes or parameters; start from a "
-                f"{self.options.method} policy trained on bounds of the same parameters"
+                f"{folder}: a {card.method} policy of other sizes; start from a "
+                f"{self.options.method} policy of this robot"
             )
         if "critic.0.weight" not in weights:
             raise InputError(f"{folder}: has no value function; start from what `pup train` wrote")
@@ -289,9 +290,11 @@ class _Job:
             "policy_sha256": sha256(folder / CARD),
             "bounds_sha256": card.bounds_sha256,
             "other_bounds": card.bounds_sha256 != self.bounds_sha256,
+            "other_parameters": card.parameters != self.card.parameters,
             "steps": card.provenance.get("steps"),
         }
-        return dict(for_bounds(card, weights, self.bounds.lower, self.bounds.upper))
+        names, lower, upper = self.card.parameters, self.bounds.lower, self.bounds.upper
+        return dict(for_bounds(card, weights, names, lower, upper))
 
     def _card(self, task: WalkingTask) -> PolicyCard:
         robot, settings = self.robot, self.settings

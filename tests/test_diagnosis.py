@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pup.diagnosis import selection
 from pup.diagnosis.engine import Diagnosis, diagnose
 from pup.diagnosis.evidence import Projector, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Coordinate, Fit, fit_together
@@ -62,8 +63,12 @@ def test_a_concealed_effect_is_named_and_measured(
     assert told.held_out.after == pytest.approx(0.00205, rel=0.1)  # the noise, quantised
 
 
-def test_what_a_large_effect_hides_is_found_beside_it() -> None:
-    """Each round looks around its own model: what else is missing does other things there."""
+def test_what_a_large_effect_hides_is_found_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each round looks around its own model: what else is missing does other things there.
+
+    Of very many hypotheses the hopeless are not simulated again.
+    """
+    monkeypatch.setattr(selection, "LEADING", 30)
     missing = {
         f"torque_speed_limit/slope@{SERVO}": 0.03,
         f"derivative_kick/gain@{SERVO}": 0.3,
@@ -81,6 +86,9 @@ def test_what_a_large_effect_hides_is_found_beside_it() -> None:
     )
     before = around[again.hypothesis]
     assert np.linalg.norm(again.whole - before.whole) > 0.1 * np.linalg.norm(before.whole)
+    kept = [s for s in second.ranking if s.trace.hypothesis in around]
+    old = sum(s.trace.whole is around[s.trace.hypothesis].whole for s in kept)
+    assert 0 < old < len(kept) - 20
 
 
 @pytest.mark.parametrize("seed", [3, 4])

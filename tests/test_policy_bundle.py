@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pup.errors import InputError
-from pup.policy.bundle import NumpyPolicy, read_bundle, write_bundle
+from pup.policy.bundle import NumpyPolicy, PolicyCard, read_bundle, write_bundle
 from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method
 from pup.robot import RobotDescription
@@ -60,15 +60,14 @@ def test_other_bounds_change_the_scale_and_not_the_policy(method: Method) -> Non
     card, rng = card_of(policy, method), np.random.default_rng(3)
     weights = weights_of(policy)
     own = np.array(card.parameter_lower), np.array(card.parameter_upper)
-    same = for_bounds(card, weights, *own)
+    same = for_bounds(card, weights, card.parameters, *own)
     assert same.keys() == weights.keys()
     assert all(np.array_equal(same[name], weights[name]) for name in weights)
     lower, upper = np.array([0.2, 1.0, 0.7, 0.9]), np.array([1.1, 2.0, 0.8, 0.9])
     width = np.where(upper > lower, upper - lower, 1.0)
     moved = ProjectedPolicy(policy.shape)
-    moved.load_state_dict(
-        {k: torch.from_numpy(v) for k, v in for_bounds(card, weights, lower, upper).items()}
-    )
+    other = for_bounds(card, weights, card.parameters, lower, upper)
+    moved.load_state_dict({k: torch.from_numpy(v) for k, v in other.items()})
     mu = rng.uniform(0.6, 1.4, (200, 4))
     seen = torch.from_numpy(observations(200)[0])
     before = torch.from_numpy(((mu - own[0]) / (own[1] - own[0])).astype(np.float32))
@@ -78,6 +77,32 @@ def test_other_bounds_change_the_scale_and_not_the_policy(method: Method) -> Non
         same_to_the_policy.append(lambda p, unit: p.project(unit))
     for told in same_to_the_policy:
         torch.testing.assert_close(told(policy, before), told(moved, after), rtol=1e-4, atol=2e-3)
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_other_parameters_are_seen_later_and_lost_ones_no_more(method: Method) -> None:
+    """What both know counts as before, a lost one as its middle, a new one not at all."""
+    policy = policy_of(method)
+    card, rng = card_of(policy, method), np.random.default_rng(3)
+    first, lost, *rest = card.parameters
+    names = (*rest, "new", first)
+    own = {n: (a, b) for n, a, b in zip(*_bounds(card), strict=True)} | {"new": (3.0, 5.0)}
+    lower, upper = np.array([own[name] for name in names]).T
+    moved = ProjectedPolicy(policy.shape)
+    other = for_bounds(card, weights_of(policy), names, lower, upper)
+    moved.load_state_dict({k: torch.from_numpy(v) for k, v in other.items()})
+    unit = rng.uniform(0, 1, (200, 4)).astype(np.float32)
+    unit[:, 1] = 0.5
+    after = np.column_stack([unit[:, 2:], rng.uniform(0, 1, 200), unit[:, 0]]).astype(np.float32)
+    seen = torch.from_numpy(observations(200)[0])
+    before, after = torch.from_numpy(unit), torch.from_numpy(after)
+    for told in (lambda p, u: p(seen, u), lambda p, u: p.value(seen, u)):
+        torch.testing.assert_close(told(policy, before), told(moved, after), rtol=1e-4, atol=2e-3)
+    assert lost not in names
+
+
+def _bounds(card: PolicyCard) -> tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...]]:
+    return card.parameters, card.parameter_lower, card.parameter_upper
 
 
 def test_a_bundle_is_read_as_it_was_written(bundle: Path) -> None:

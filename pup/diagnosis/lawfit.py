@@ -25,6 +25,8 @@ LONGEST = 3
 """Features of a law, at most."""
 LAWS = 3
 """Laws that are told."""
+LASTING = 4.0
+"""Recordings that are all shorter, s, tell no law of time: it would grow beyond what was seen."""
 VISIBLE = 0.05
 """A feature of which less than this share is left beside the parameters says nothing new."""
 ALIKE = 0.98
@@ -83,8 +85,11 @@ def laws(
     traces = _traces(answers, simulated, servos(replays, fit.values), joints)
     left = Projector(fit.jacobian)(traces)
     lengths = np.linalg.norm(left, axis=0)
+    lasting = max(r.time[-1] - r.time[0] for r in answers.measured.recordings) > LASTING
     names = [
-        n for n, a, b in zip(FEATURES, lengths, _lengths(traces), strict=True) if a > VISIBLE * b
+        n
+        for n, a, b in zip(FEATURES, lengths, _lengths(traces), strict=True)
+        if a > VISIBLE * b and (lasting or "t" not in FEATURES[n])
     ]
     shown = np.array([list(FEATURES).index(n) for n in names])
     if not len(shown):

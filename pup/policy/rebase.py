@@ -1,6 +1,6 @@
 """A policy's weights for other bounds than those it was trained on."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,26 +12,39 @@ from pup.policy.shape import PolicyShape
 Array = NDArray[np.float64]
 
 
-def for_bounds(card: PolicyCard, weights: Weights, lower: Array, upper: Array) -> Weights:
+def for_bounds(
+    card: PolicyCard, weights: Weights, names: Sequence[str], lower: Array, upper: Array
+) -> Weights:
     """Weights that make of mu under other bounds what they made of it under their own.
 
     Networks see mu on the unit scale of the bounds, centred: the same mu is another number under
     other bounds. What turns the one into the other is a factor and a shift for each parameter; the
-    first layers that see mu take them in. Under the same bounds all weights stay the same bits.
+    first layers that see mu take them in. A parameter that the policy does not know changes nothing
+    at first, and of one that is no longer there it sees the middle. Under the same bounds all
+    weights stay the same bits.
 
     Args:
       card: of the policy.
       weights: of it, by the names of ProjectedPolicy.
-      lower: other bounds of `card.parameters`, physical, shape (n_parameters,).
+      names: of the parameters that it shall see.
+      lower: their bounds, physical, shape (n_parameters,).
       upper: upper ones.
     """
+    known = [i for i, name in enumerate(card.parameters) if name in names]
+    place = [names.index(card.parameters[i]) for i in known]
     old, new = card.scale, UnitScale(lower, upper)
-    factor = new.width / old.width
-    shift = (2 * (new.lower - old.lower) + (new.width - old.width)) / old.width
+    width = old.width[known]
+    factor = new.width[place] / width
+    shift = (2 * (new.lower[place] - old.lower[known]) + (new.width[place] - width)) / width
     told = dict(weights)
     for layer, first in _seeing(card.shape).items():
         if f"{layer}.weight" in told:
-            told |= _moved(told, layer, first, factor, shift)
+            weight, bias = told[f"{layer}.weight"], told[f"{layer}.bias"]
+            seen = np.array(weight[:, first:], dtype=np.float64)[:, known]
+            sees = np.zeros((len(weight), len(names)))
+            sees[:, place] = seen * factor
+            told[f"{layer}.weight"] = np.hstack([weight[:, :first], sees.astype(weight.dtype)])
+            told[f"{layer}.bias"] = (bias + seen @ shift).astype(bias.dtype)
     return told
 
 
@@ -41,16 +54,3 @@ def _seeing(shape: PolicyShape) -> dict[str, int]:
     if shape.latent:
         return seeing | {"projection.0": 0}
     return seeing | ({"actor.0": shape.proprioception} if shape.parameters else {})
-
-
-def _moved(
-    weights: Weights, layer: str, first: int, factor: Array, shift: Array
-) -> dict[str, NDArray[Any]]:
-    weight, bias = weights[f"{layer}.weight"], weights[f"{layer}.bias"]
-    exact = np.array(weight, dtype=np.float64)
-    seen = exact[:, first:].copy()
-    exact[:, first:] *= factor
-    return {
-        f"{layer}.weight": exact.astype(weight.dtype),
-        f"{layer}.bias": (bias + seen @ shift).astype(bias.dtype),
-    }

@@ -185,8 +185,9 @@ class _Graph:
         for seed in self._seeds(walk):
             refit = f"presysid-r{seed}-corrected"
             if refit not in self._cells:
-                # NN-PD beside the effects: the same parameters as the policy that is trained on.
-                told = self._fitted(replace(self.plan.presysid, compare=False))
+                # PD servos: what a diagnosis finds is missing beside these.
+                fits = replace(self.plan.presysid, actuator="pd", compare=False, near=True)
+                told = self._fitted(fits)
                 needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
                 weight = self._cells[f"presysid-r{seed}"].weight
                 self._add(Cell(refit, "presysid", needs, told, self._given(), weight))
