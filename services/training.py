@@ -278,8 +278,8 @@ class _Job:
         if folder is None:
             return None
         card, weights = read_bundle(folder, self.robot)
-        alike = replace(card.shape, parameters=self.shape.parameters) == self.shape
-        if card.method != self.card.method or not alike:
+        seen = {name: getattr(self.shape, name) for name in ("parameters", "privileged")}
+        if card.method != self.card.method or replace(card.shape, **seen) != self.shape:
             raise InputError(
                 f"{folder}: a {card.method} policy of other sizes; start from a "
                 f"{self.options.method} policy of this robot"
