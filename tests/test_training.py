@@ -19,6 +19,7 @@ pytest.importorskip("gymnasium")
 import torch
 
 from pup.errors import InputError
+from pup.physics.parameters import robot_space
 from pup.policy.bundle import NumpyPolicy
 from pup.policy.losses import LossWeights
 from pup.policy.network import ProjectedPolicy
@@ -260,6 +261,29 @@ def test_a_job_leaves_what_a_robot_and_a_reader_need(ray_here: None, tmp_path: P
     assert job(tmp_path / "further", further)["done"]
     with pytest.raises(InputError, match="other sizes"):
         job(tmp_path / "other", replace(SMALL, start=tmp_path / "policy"))
+
+
+@pytest.mark.ray
+def test_a_policy_is_trained_further_with_other_servos(ray_here: None, tmp_path: Path) -> None:
+    """It has seen an NN-PD's parameters, and then sees the gains of PD servos."""
+    job(tmp_path / "first", replace(SMALL, steps=32))
+    space = robot_space(ROBOT, "pd")
+    limits = zip(space.names, space.units, space.nominal, strict=True)
+    told = json.loads(ROBOT.identified_path.read_text()) | {
+        "actuator": {"kind": "pd", "weights": []},
+        "parameters": [
+            {"name": n, "unit": u, "nominal": x, "lower": x - 1e-3, "upper": x + 1e-3}
+            for n, u, x in limits
+        ],
+    }
+    (tmp_path / "pd.json").write_text(json.dumps(told))
+    further = replace(SMALL, steps=32, start=tmp_path / "first" / "policy")
+    out = tmp_path / "further"
+    document = training.train(
+        ROBOT, tmp_path / "pd.json", further, out, lambda: nullcontext(2), lambda row, steps: None
+    )
+    assert document["provenance"]["start"]["other_parameters"]
+    assert NumpyPolicy.load(out / "policy", ROBOT).card.parameters == space.names
 
 
 @pytest.mark.ray
