@@ -17,6 +17,7 @@ import json
 import os
 import secrets
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -41,6 +42,8 @@ START = 120.0
 """For a node to be there, s."""
 CALM = 4.0
 """Between two disturbances, after the stage went on and the lost node was replaced, s."""
+RECORDED = "step_0.1_0", "step_0.3_0", "step_0.6_0"
+"""Of the recordings that come with darwin_op2: enough for a fit of a minute."""
 STUCK = 300.0
 """After which a stage counts as stuck, s."""
 
@@ -82,13 +85,17 @@ class Cluster(AbstractContextManager["Cluster"]):
 
     def __enter__(self) -> "Cluster":
         self._clean()
-        ip("link", "add", BRIDGE, "type", "bridge")
-        ip("addr", "add", f"{NET}.1/24", "dev", BRIDGE)
-        ip("link", "set", BRIDGE, "up")
-        head = ("--head", "--port=6399", "--num-cpus=0", "--include-dashboard=false")
-        self._start("head", (), f"{NET}.1", *head, f"--temp-dir={self.temp}")
-        self.add()
-        self.add()
+        try:
+            ip("link", "add", BRIDGE, "type", "bridge")
+            ip("addr", "add", f"{NET}.1/24", "dev", BRIDGE)
+            ip("link", "set", BRIDGE, "up")
+            head = ("--head", "--port=6399", "--num-cpus=0", "--include-dashboard=false")
+            self._start("head", (), f"{NET}.1", *head, f"--temp-dir={self.temp}")
+            self.add()
+            self.add()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -151,7 +158,8 @@ class Cluster(AbstractContextManager["Cluster"]):
         """Remove what an earlier run left of the network."""
         for namespace in Path("/run/netns").glob("pupn*"):
             ip("netns", "del", namespace.name, check=False)
-        ip("link", "del", BRIDGE, check=False)
+        for link in (*Path("/sys/class/net").glob("pupv*"), Path(BRIDGE)):
+            ip("link", "del", link.name, check=False)
 
 
 @dataclass(frozen=True)
@@ -188,10 +196,12 @@ def _logged(out: Path) -> float:
 def stages(recordings: Path, friction: Path) -> dict[str, Stage]:
     """The stages that work on Ray."""
     robot = ("--robot", "darwin_op2")
-    fits = ("--generations", "40", "--subsets", "6", "--subset-generations", "40")
+    some = [str(recordings / f"{name}.parquet") for name in RECORDED]
+    fits = ("--actuator", "pd", "--generations", "20", "--subsets", "6")
+    fits += ("--subset-generations", "60", "--fraction", "0.5", "--no-comparison")
     return {
         "presysid": Stage(
-            ("presysid", str(recordings), *robot, *fits, "--fraction", "0.2", "--no-comparison"),
+            ("presysid", *some, *robot, *fits),
             _written("checkpoints/**/*.npz"),
             _document("bounds.json"),
         ),
@@ -308,6 +318,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--recordings", type=Path, default=Path("pup/robots/darwin_op2/recordings"))
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # nodes are ended then too
     out = options.out.absolute() / options.stage
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
