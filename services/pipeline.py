@@ -122,8 +122,11 @@ class _Job:
             self.left_out[DIAGNOSIS] = "as told"
             return None
         self._do(self._diagnosis())
-        if not self.documents[DIAGNOSIS]["findings"]:
-            self.left_out[CORRECTED] = "the diagnosis found nothing to correct"
+        told = self.documents[DIAGNOSIS]
+        if not told["findings"]:
+            undetermined = f"undetermined: {told['reason']}"
+            nothing = told["verdict"] == "none"
+            self.left_out[CORRECTED] = "nothing to correct was found" if nothing else undetermined
             return None
         robot = RobotDescription.load(str(self.out / DIAGNOSIS / CORRECTED))
         first = self.mission.presysid

@@ -99,5 +99,5 @@ def test_where_nothing_is_missing_there_is_no_second_half(tmp_path: Path) -> Non
     assert done.code == 0, done.err
     told = done.json()
     assert told["diagnosis"]["verdict"] == "none"
-    assert told["left_out"]["corrected"] == "the diagnosis found nothing to correct"
+    assert told["left_out"]["corrected"] == "nothing to correct was found"
     assert list(told["took"]) == STAGES[:3]
