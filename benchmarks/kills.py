@@ -122,7 +122,8 @@ def main() -> None:
     options = parser.parse_args()
     took = undisturbed(options.out / "whole", options.arguments)
     print(f"undisturbed: {took:.0f} s", flush=True)
-    moments = sorted(random.Random(options.seed).uniform(0, took) for _ in range(options.kills))
+    rng = random.Random(options.seed)
+    moments = sorted(rng.uniform(0, took) for _ in range(options.kills))
     gaps = [b - a for a, b in zip([0.0, *moments], moments, strict=False)]
     begin = time.monotonic()
     struck = killed(options.out / "parts", options.arguments, gaps)
