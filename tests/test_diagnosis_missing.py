@@ -24,7 +24,6 @@ from pup.sysid.figures import drawing_style
 from pup.sysid.html import Html
 
 KNEE = Place("joint", "l_knee")
-LAW = Law(("|u|*sgn(v)",), (-0.12,), 300.0, 10.0)
 NAMELESS = "Something that no known effect explains happens"
 HALVES = "Parameters that differ between halves of the data"
 
@@ -37,6 +36,11 @@ def leg() -> Maker:
 @pytest.fixture(scope="module")
 def backlash(leg: Maker) -> Diagnosis:
     return leg.missing("backlash", KNEE, gap=0.008)
+
+
+def brake(leg: Maker) -> Law:
+    """A law that was found: it brakes by what is asked of the servo."""
+    return Law(("|u|*sgn(v)",), (-0.12,), 300.0, 10.0, np.zeros((leg.samples, 1)))
 
 
 def section(parts: Iterable[Html], folder: Path) -> Page:
@@ -195,7 +199,7 @@ def test_a_nameless_cause_alone_is_the_headline(leg: Maker, tmp_path: Path) -> N
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_law_that_holds_is_told(leg: Maker, tmp_path: Path) -> None:
-    shown = page(leg.beyond(leg.nothing(2.0), KNEE, LAW), tmp_path)
+    shown = page(leg.beyond(leg.nothing(2.0), KNEE, brake(leg)), tmp_path)
     assert f"{NAMELESS} at the left knee; it acts like the torque \u22120.12 |u|*sgn(v)." in (
         shown.text
     )
@@ -207,7 +211,7 @@ def test_a_law_that_holds_is_told(leg: Maker, tmp_path: Path) -> None:
 
 def test_a_law_that_explains_little_is_not_said_to_describe_it(leg: Maker) -> None:
     leg.rng = np.random.default_rng(2)  # whatever tests ran before
-    told = leg.beyond(leg.nothing(2.0), KNEE, LAW)
+    told = leg.beyond(leg.nothing(2.0), KNEE, brake(leg))
     weak = replace(told.findings[0], gain=0.01 * told.findings[0].gain)
     words = sentence(told, weak, speech(told))
     assert words.startswith(f"{NAMELESS} at the left knee; the best law for it explains only 2")

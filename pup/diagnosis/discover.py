@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import fit_together
+from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.impulses import BUDGET, responses
 from pup.diagnosis.lacks import Lack, lack_of_fit
 from pup.diagnosis.lawfit import LAWS, Law, laws
@@ -19,7 +19,15 @@ from pup.diagnosis.locate import BAND, MissingInput, explained_by
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import KEPT, Model, Selector
-from pup.diagnosis.verdict import UNKNOWN, Finding, Parameter, doubt, left_over, unexplained_errors
+from pup.diagnosis.verdict import (
+    UNKNOWN,
+    Finding,
+    Parameter,
+    doubt,
+    left_over,
+    reaches,
+    unexplained_errors,
+)
 from pup.physics.terms import Place
 from pup.physics.terms.learned import LearnedLaw, unit
 from pup.robot import TermSpec
@@ -34,8 +42,11 @@ MATERIAL = 0.09
 """Mean square of a channel's unexplained errors, in that of its noise, that matters."""
 FORM = 0.05
 """Share of its own trace that a wrong form of a known effect may leave."""
-ITERATIONS = 14
-"""Steps of a law's refit, at most: it may start far from where it ends."""
+ROUGH, LAST = 5, 14
+"""Steps of the refits of all laws until they are compared, and of the best: they may start far from
+where they end."""
+CLOSE = 3
+"""So many of them are refitted to the end."""
 TRIED = 2
 """Laws that are refitted without each fold."""
 SHARED = 0.6
@@ -160,12 +171,10 @@ def _kept(
     tried: Sequence[Law], place: Place, model: Model, selector: Selector
 ) -> list[tuple[Law, Model]]:
     """The laws that predict motions left out, refitted, best first."""
-    fits = [law.started(model.fit, place) for law in tried]
-    fit_together(fits, selector.replays, selector.noise, iterations=ITERATIONS)
     kept: list[tuple[float, Law, Model]] = []
     gained = [
         (law, fit)
-        for law, fit in zip(tried, fits, strict=True)
+        for law, fit in _refitted(tried, place, model, selector)
         if model.fit.chi2 - fit.chi2 > selector.enough
     ]
     if not gained:
@@ -183,6 +192,20 @@ def _kept(
             kept.append((worth, replace(law, coefficients=values), after))
     kept.sort(key=lambda told: -told[0])
     return _foreseen([(law, after) for _, law, after in kept], model, selector)
+
+
+def _refitted(
+    tried: Sequence[Law], place: Place, model: Model, selector: Selector
+) -> list[tuple[Law, Fit]]:
+    """The most promising laws, each refitted with the model."""
+    fits = [(law, law.started(model.fit, place)) for law in tried]
+    fit_together([fit for _, fit in fits], selector.replays, selector.noise, iterations=ROUGH)
+    fits.sort(key=lambda told: told[1].chi2 + told[0].price * len(told[0].features))
+    close = [fit for _, fit in fits[:CLOSE]]
+    for fit in close:
+        fit.thorough, fit.done, fit.jacobian = True, False, None
+    fit_together(close, selector.replays, selector.noise, iterations=LAST)
+    return fits[:CLOSE]
 
 
 def _foreseen(
@@ -209,12 +232,12 @@ def _error(model: Model, selector: Selector) -> float:
 
 def _parameters(law: Law, place: Place, model: Model) -> dict[str, Parameter]:
     """The law's coefficients with their 90 % intervals."""
-    deviation = np.sqrt(np.diag(model.fit.covariance()))
+    reach = reaches(model)
     told = {}
     for feature, name in zip(law.features, law.columns(place), strict=True):
         i = model.fit.names.index(name)
         coordinate, at = model.fit.coordinates[i], float(model.fit.at[i])
-        ends = (at - BAND * float(deviation[i]), at + BAND * float(deviation[i]))
+        ends = (at - reach[i], at + reach[i])
         told[feature] = Parameter(
             coordinate.value(at), unit(feature), *(coordinate.value(e) for e in ends)
         )

@@ -151,8 +151,9 @@ def diagnose(
         nominal, done = _weighed(nominal, done, replays, rng, progress, first, effects)
     if done is None:
         return told("undetermined", "the motions would not show any effect of the library")
-    model, rounds, selector = done.model, done.rounds, done.selector
+    rounds, selector = done.rounds, done.selector
     progress("what is left", 0.8)
+    model = selector.predicting(done.model)
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
     shown = held_out(measured, selector.nominal, final, seed)

@@ -141,7 +141,7 @@ def threshold(
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.maximum(values, 0))
     products = root @ rng.normal(size=(len(root), draws))
-    largest = np.zeros(draws)
+    largest: dict[int, Array] = {}  # by freedom: of the same, the largest is the most surprising
     start = 0
     for trace in found:
         width = trace.basis.shape[1]
@@ -150,13 +150,19 @@ def threshold(
         statistic = (part**2).sum(axis=0)
         if not trace.hypothesis.signed:
             statistic = np.where(part[0] < 0, 0.0, statistic)
-        if width > 1:
-            statistic = stats.chi2.isf(stats.chi2.sf(statistic, width), 1)
-        np.maximum(largest, statistic, out=largest)
+        largest[width] = np.maximum(largest.get(width, 0.0), statistic)
+    surprise = np.max([_as_of_one(told, width) for width, told in largest.items()], axis=0)
     # The tail of a largest of many is exponential: its far end from its near one.
-    near = float(np.quantile(largest, 0.9))
-    excess = float(np.mean(largest[largest > near] - near))
+    near = float(np.quantile(surprise, 0.9))
+    excess = float(np.mean(surprise[surprise > near] - near))
     return near + excess * float(np.log(0.1 / false_alarms))
+
+
+def _as_of_one(statistic: Array, freedom: int) -> Array:
+    """Statistics as those of a single magnitude that are as improbable."""
+    if freedom == 1:
+        return statistic
+    return np.asarray(stats.chi2.isf(stats.chi2.sf(statistic, freedom), 1))
 
 
 def overlap(a: Trace, b: Trace) -> float:

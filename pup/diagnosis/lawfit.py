@@ -6,7 +6,7 @@ was estimated first would have smoothed away what tells one feature from another
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +42,15 @@ class Law:
       coefficients: N m per unit of each feature.
       gain: drop of chi-squared that it promises, less what its length costs.
       price: what one feature costs.
+      traces: whitened changes of the samples by each feature at its typical size, shape
+        (n_samples, n_features).
     """
 
     features: tuple[str, ...]
     coefficients: tuple[float, ...]
     gain: float
     price: float
+    traces: Array = field(compare=False, repr=False)
 
     def __str__(self) -> str:
         parts = [
@@ -61,12 +64,19 @@ class Law:
         return tuple(column(LearnedLaw.effect, name, place) for name in self.features)
 
     def started(self, fit: Fit, place: Place) -> Fit:
-        """A fit of a model with the law, to be refined."""
+        """A rough fit of a model with the law: the traces are columns of its Jacobian."""
+        assert fit.jacobian is not None
         sizes = [typical(name) for name in self.features]
         names = self.columns(place)
         free = tuple(Coordinate(n, s, -MOST, MOST) for n, s in zip(names, sizes, strict=True))
-        start = np.array(self.coefficients) / np.array(sizes)
-        return Fit(fit.coordinates + free, np.r_[fit.at, start], fixed=dict(fit.fixed))
+        return Fit(
+            fit.coordinates + free,
+            np.r_[fit.at, np.array(self.coefficients) / np.array(sizes)],
+            fixed=dict(fit.fixed),
+            jacobian=np.hstack([fit.jacobian, self.traces]),
+            age=1,
+            thorough=False,
+        )
 
 
 def laws(
@@ -108,7 +118,8 @@ def laws(
             gain = float(weights @ match[chosen]) - price * count
             if gain > 0:
                 coefficients = tuple(float(w) for w in weights * sizes[chosen])
-                law = Law(tuple(names[i] for i in chosen), coefficients, gain, price)
+                told = tuple(names[i] for i in chosen)
+                law = Law(told, coefficients, gain, price, traces[:, shown[chosen]])
                 found.setdefault(frozenset(law.features), law)
     ranked = sorted(found.values(), key=lambda law: -law.gain)
     simple = [law for law in ranked if len(law.features) == 1]

@@ -62,6 +62,7 @@ class Model:
       held_out: what each fold costs by a fit without it, shape (n_folds,); see `folds.left_out`.
       measured: the samples that it was fitted to.
       predicted: what those fits predict, shape (n_samples,), rad; empty where nobody has asked.
+      refits: their coordinates, shape (n_folds, n_free); empty likewise.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -70,6 +71,7 @@ class Model:
     held_out: Array
     measured: Measured
     predicted: Array = field(default_factory=lambda: np.empty(0))
+    refits: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def samples(self) -> int:
@@ -371,7 +373,7 @@ class Selector:
         predicted = measured.values.copy()
         for inside, simulated in zip(insides, told, strict=True):
             predicted[inside] = np.where(np.isnan(simulated[0]), LOST, simulated[0])
-        return replace(model, predicted=predicted)
+        return replace(model, predicted=predicted, refits=np.array([fit.at for fit in fits]))
 
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import overlap
+from pup.diagnosis.folds import scatter
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.laws import EQUATIONS
+from pup.diagnosis.locate import BAND
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Model, Round, Selector
@@ -179,6 +181,12 @@ def findings(
     return tuple(sorted(told, key=lambda f: -f.gain))
 
 
+def reaches(model: Model) -> Array:
+    """Half the width of 90 % intervals of coordinates: by noise, or by how motions differ."""
+    noise = BAND * np.sqrt(np.diag(model.fit.covariance()))
+    return np.asarray(np.maximum(noise, scatter(model.refits)))
+
+
 def held_out(measured: Measured, before: Model, after: Model, seed: int) -> HeldOut:
     """Errors of the joints on motions left out, with an interval over recordings."""
     joints = measured.channel < len(measured.robot.joints)
@@ -258,15 +266,15 @@ def twins_of(
 
 def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
     """What was fitted of an effect, and the shapes that were chosen."""
-    deviation = np.sqrt(np.diag(final.fit.covariance()))
+    reach = reaches(final)
     units = {q.name: q.unit for q in TERMS[hypothesis.effect].quantities}
     told = {}
     for i, coordinate in enumerate(final.fit.coordinates):
         quantity = _quantity(coordinate.name, hypothesis)
         if quantity is None:
             continue
-        at, reach = float(final.fit.at[i]), 1.645 * float(deviation[i])
-        ends = (max(at - reach, coordinate.lower), min(at + reach, coordinate.upper))
+        at = float(final.fit.at[i])
+        ends = (max(at - reach[i], coordinate.lower), min(at + reach[i], coordinate.upper))
         told[quantity] = Parameter(
             coordinate.value(at), units[quantity], *(coordinate.value(e) for e in ends)
         )
