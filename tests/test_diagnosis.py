@@ -123,6 +123,8 @@ def test_poor_data_tell_nothing() -> None:
         assert told.verdict == "undetermined"
         assert why in told.reason
         assert not told.findings
+        assert told.ask is not None
+        assert told.ask.motion not in {r.motion for r in poor}
 
 
 class TestNoise:

@@ -58,30 +58,34 @@ def changed(
 
 @pytest.mark.parametrize("seed", range(5))
 def test_sound_recordings_are_not_suspected(seed: int) -> None:
-    assert why_poor(Measured.of(LEG, leg(seed))) == ""
+    assert why_poor(Measured.of(LEG, leg(seed))) is None
 
 
 def test_a_noiseless_encoder_at_rest_is_not_clipped() -> None:
     """Steps end where they end, again and again at one reading; so they do in the middle."""
-    assert why_poor(Measured.of(LEG, leg(noise=0.0))) == ""
+    assert why_poor(Measured.of(LEG, leg(noise=0.0))) is None
 
 
 @pytest.mark.parametrize(
-    ("spoil", "why"),
+    ("spoil", "why", "cure"),
     [
-        (lambda runs: runs[:1], "second motion"),
-        (lambda runs: [thinned(r, 7) for r in runs], "0.21 s apart"),
-        (lambda runs: changed(runs, KNEE, lambda q: 0 * q + q[0]), "l_knee hardly moves"),
-        (lambda runs: changed(runs, PITCH, lambda q: q.clip(-0.15, 0.15)), "l_ank_pitch stop"),
-        (exchanged, "l_knee follow the commands of l_ank_pitch"),
+        (lambda runs: runs[:1], "second motion", ""),
+        (lambda runs: [thinned(r, 7) for r in runs], "0.21 s apart", "20 Hz"),
+        (lambda runs: changed(runs, KNEE, lambda q: 0 * q + q[0]), "l_knee hardly moves", "mended"),
+        (lambda runs: changed(runs, PITCH, lambda q: q.clip(-0.15, 0.15)), "l_ank_pitch stop",
+         "whole range"),
+        (exchanged, "l_knee follow the commands of l_ank_pitch", "servo ids"),
         (lambda runs: [replace(r, target=0 * r.target + i, position=0 * r.position + i)
                        for i, r in enumerate(runs)],
-         "no joint moves"),
+         "no joint moves", ""),
         (lambda runs: [replace(r, time=r.time[:3], target=r.target[:3], position=r.position[:3])
-                       for r in runs], "too few"),
+                       for r in runs], "too few", ""),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_recordings_is_said(
-    spoil: Callable[[Sequence[Recording]], Sequence[Recording]], why: str
+def test_what_is_wrong_with_recordings_and_how_to_mend_it_is_said(
+    spoil: Callable[[Sequence[Recording]], Sequence[Recording]], why: str, cure: str
 ) -> None:
-    assert why in why_poor(Measured.of(LEG, spoil(leg())))
+    poor = why_poor(Measured.of(LEG, spoil(leg())))
+    assert poor is not None
+    assert why in poor.reason
+    assert cure in poor.cure and bool(cure) == bool(poor.cure)

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from pup.diagnosis.experiment import Rival, next_recording
+from pup.diagnosis.experiment import (
+    NextRecording,
+    Pair,
+    Rival,
+    next_recording,
+    recorded_again,
+    recorded_besides,
+)
 from pup.diagnosis.fitting import Fit, term_coordinate
 from pup.diagnosis.menu import options
 from pup.diagnosis.residuals import Noise
@@ -65,3 +72,22 @@ def test_options_are_recordings_the_robot_can_make(robot: RobotDescription) -> N
     floors = [option for option in menu if option.other_floor]
     assert bool(floors) == (robot is OP2)
     assert all(option.recording.support == "ground" for option in floors)
+
+
+def test_where_motions_tell_nothing_another_one_is_asked_for() -> None:
+    measured = measured_under(BENCH, {}, ("step", "triangle"), 1.0)
+    told = recorded_besides(measured)
+    assert told.motion == "chirp" and told.setup == {} and told.splits == ()
+    assert told.document()["splits"] == []
+
+
+def test_where_recordings_are_spoilt_the_same_is_asked_for_again() -> None:
+    told = recorded_again(measured_under(BENCH, {}, ("hold",), 1.0), "read at 20 Hz or faster")
+    assert told.motion == "hold"
+    assert told.document()["reason"] == "the same motions again, read at 20 Hz or faster"
+
+
+def test_what_the_contract_has_no_name_for_is_told_as_unknown() -> None:
+    pair = Pair("derivative_kick", "command_delay", 50.0)
+    told = NextRecording("step", "steps", "bench", {}, False, "", (pair,)).document()
+    assert told["splits"] == [["unknown", "command_delay"]]

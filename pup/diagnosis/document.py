@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.laws import NAMELESS
+from pup.diagnosis.laws import contract_name
 from pup.diagnosis.verdict import Alternative, Finding, HeldOut
 from pup.diagnosis.wording import SLIDING
-from pup.physics.terms import TERMS, UNLISTED, Term
+from pup.physics.terms import TERMS, Term
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits
 
@@ -56,7 +56,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
 
 def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]) -> dict[str, Any]:
     return {
-        "effect": _named(finding.effect),
+        "effect": contract_name(finding.effect),
         "place": _place(finding, robot),
         "regime": finding.regime,
         "when": [{"recording": w.recording, "start": w.start, "end": w.end} for w in finding.when],
@@ -71,7 +71,7 @@ def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]
         "probability": round(finding.probability, 6),
         "equivalents": [
             {
-                "effect": _named(a.effect),
+                "effect": contract_name(a.effect),
                 "place": _place(a, robot),
                 "probability": round(a.probability, 6),
             }
@@ -80,11 +80,6 @@ def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]
         "absorbed_by": dict(finding.absorbed_by),
         "law": finding.law,
     }
-
-
-def _named(effect: str) -> str:
-    """An effect by the contract's names."""
-    return NAMELESS if effect in UNLISTED else effect
 
 
 def _place(claim: Finding | Alternative, robot: RobotDescription) -> dict[str, Any]:

@@ -9,13 +9,19 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.discover import Unexplained, unexplained
 from pup.diagnosis.evidence import Trace
-from pup.diagnosis.experiment import NextRecording, next_recording, rivals_of
+from pup.diagnosis.experiment import (
+    NextRecording,
+    next_recording,
+    recorded_again,
+    recorded_besides,
+    rivals_of,
+)
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
-from pup.diagnosis.poor import why_poor
+from pup.diagnosis.poor import Poor, why_poor
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise, assumed_noise, quiet_noise
@@ -128,6 +134,8 @@ def diagnose(
             "found": (),
             "enough": 0.0,
         }
+        if verdict == "undetermined":
+            known["ask"] = _instead(measured, poor, seed)
         return Diagnosis(
             robot=robot,
             verdict=verdict,
@@ -140,7 +148,7 @@ def diagnose(
         )
 
     if poor:
-        return told("undetermined", poor)
+        return told("undetermined", poor.reason)
     first = _first_look(nominal, replays, rng, progress, effects)
     if first is not None:
         nominal = replace(nominal, certificate=first[0].certificate)
@@ -187,6 +195,12 @@ def diagnose(
     every = (*named, left.finding) if left else named
     evidence["findings"] = tuple(sorted(every, key=lambda finding: -finding.gain))
     return told("mismatch", ask=ask, **evidence)
+
+
+def _instead(measured: Measured, poor: Poor | None, seed: int) -> NextRecording:
+    """What to record where these recordings tell nothing."""
+    cure = poor.cure if poor else ""
+    return recorded_again(measured, cure) if cure else recorded_besides(measured, seed)
 
 
 def _weighed(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.fitting import Fit, difference, fit_together, term_coordinate
-from pup.diagnosis.laws import WORDS
+from pup.diagnosis.laws import WORDS, contract_name
 from pup.diagnosis.menu import Option, options
 from pup.diagnosis.replays import Replays, Row
 from pup.diagnosis.residuals import Measured, Noise
@@ -90,7 +90,8 @@ class NextRecording:
 
     def document(self) -> dict[str, Any]:
         """As in CONTRACTS.md, section 5."""
-        pairs = dict.fromkeys((pair.first, pair.second) for pair in self.splits)
+        named = [(contract_name(pair.first), contract_name(pair.second)) for pair in self.splits]
+        pairs = dict.fromkeys(named)
         return {
             "motion": self.motion,
             "reason": self.reason,
@@ -180,6 +181,34 @@ def next_recording(
     _, option, expected = best
     splits = tuple(pair for pair in expected if pair.expected > SPLITS)
     return _told(option, rivals, splits, expected) if splits else None
+
+
+def recorded_again(measured: Measured, cure: str) -> NextRecording:
+    """The same motions once more, where these recordings of them can show nothing.
+
+    Args:
+      measured: what was recorded.
+      cure: what to do about it.
+    """
+    first = measured.recordings[0]
+    words = f"the same motions again, {cure}"
+    return NextRecording(first.motion, words, first.support, {}, False, words, ())
+
+
+def recorded_besides(measured: Measured, seed: int = 0) -> NextRecording:
+    """A motion of another type, where those recorded do not tell; the least effort there is.
+
+    Args:
+      measured: what was recorded.
+      seed: of the motion.
+    """
+    menu = [o for o in options(measured.robot, seed) if o.plain]
+    known = measured.motions()
+    option = next((o for o in menu if o.recording.motion not in known), menu[0])
+    reason = f"{option.words}, beside what was recorded, moves the joints in another way"
+    return NextRecording(
+        option.recording.motion, option.words, option.recording.support, {}, False, reason, ()
+    )
 
 
 def _told(

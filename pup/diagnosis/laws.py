@@ -1,5 +1,7 @@
 """What each effect is, in an equation and in plain words."""
 
+from pup.physics.terms import UNLISTED
+
 NAMELESS = "unknown"
 """The effect of a finding that the library has no name for."""
 EQUATIONS = {
@@ -81,3 +83,8 @@ WORDS = {
     "external_force": "a force from outside, such as a tether",
     NAMELESS: "something that no known effect explains",
 }
+
+
+def contract_name(effect: str) -> str:
+    """An effect as CONTRACTS.md, section 6, names it; what that does not list has no name."""
+    return NAMELESS if effect in UNLISTED else effect

@@ -5,6 +5,7 @@ has, and well enough to sound sure. Each of these leaves a mark in the readings 
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -34,14 +35,27 @@ EXCHANGED = 0.5
 they are off from its own."""
 
 
-def why_poor(measured: Measured) -> str:
-    """Why some recordings can show nothing; empty where they may."""
-    return next(_reasons(measured), "")
+@dataclass(frozen=True)
+class Poor:
+    """What is wrong with recordings.
+
+    Attributes:
+      reason: why they can show nothing.
+      cure: what to do when the same motions are recorded again; empty where others are needed.
+    """
+
+    reason: str
+    cure: str = ""
 
 
-def _reasons(measured: Measured) -> Iterator[str]:
+def why_poor(measured: Measured) -> Poor | None:
+    """Why some recordings can show nothing; None where they may."""
+    return next(_reasons(measured), None)
+
+
+def _reasons(measured: Measured) -> Iterator[Poor]:
     if len(measured.values) < FEWEST:
-        yield f"{len(measured.values)} readings are too few to tell anything"
+        yield Poor(f"{len(measured.values)} readings are too few to tell anything")
         return
     joints = range(len(measured.robot.joints))
     angle = Scale.of(measured.robot).angle
@@ -54,35 +68,39 @@ def _reasons(measured: Measured) -> Iterator[str]:
         for j in joints
     ]
     if max(moves) < MOTION * angle:
-        yield f"no joint moves by more than {MOTION:g} rad"
+        yield Poor(f"no joint moves by more than {MOTION:g} rad")
     if len(measured.recordings) < 2:
-        yield "one recording leaves nothing to check a finding on; record a second motion"
+        yield Poor("one recording leaves nothing to check a finding on; record a second motion")
     step = np.diff(measured.time)
     apart = float(np.median(step[step > 0]))
     if apart > SLOWEST:
-        yield (
+        yield Poor(
             f"readings are {apart:.2g} s apart, and servos answer within 0.1 s; record at 20 Hz or "
-            "faster"
+            "faster",
+            "read at 20 Hz or faster",
         )
     targets = _ordered(measured, [r.target for r in measured.recordings])
     asked = np.concatenate(targets)
     for j, name in enumerate(measured.robot.joint_names):
         wanted = max(_reach(target[:, j]) for target in targets)
         if wanted >= ASKED * angle and moves[j] < DEAD * wanted:
-            yield (
+            yield Poor(
                 f"{name} hardly moves though it is asked to: its encoder is dead or the joint is "
-                "blocked; look at it, or leave these recordings out"
+                "blocked; look at it, or leave these recordings out",
+                f"with {name} mended",
             )
         if _clipped(measured, j):
-            yield (
+            yield Poor(
                 f"readings of {name} stop short at an end of their range, again and again at the "
-                "same value: they are clipped; record with the encoder's whole range"
+                "same value: they are clipped; record with the encoder's whole range",
+                f"with the whole range of the encoder of {name}",
             )
     exchanged = _exchanged(measured, asked)
     if exchanged:
-        yield (
+        yield Poor(
             f"readings of {exchanged[0]} follow the commands of {exchanged[1]}: columns or servo "
-            "ids are exchanged"
+            "ids are exchanged",
+            f"with the servo ids of {exchanged[0]} and {exchanged[1]} put right",
         )
 
 
