@@ -12,15 +12,9 @@ from pup.diagnosis.engine import Diagnosis, diagnose
 from pup.diagnosis.evidence import Projector, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Coordinate, Fit, fit_together
 from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.noise import noise_floor, quanta, quiet_noise
 from pup.diagnosis.replays import Batch, Bench, Replays, threads
-from pup.diagnosis.residuals import (
-    Measured,
-    Noise,
-    noise_floor,
-    quanta,
-    quiet_noise,
-    steady_start,
-)
+from pup.diagnosis.residuals import Measured, Noise, steady_start
 from pup.diagnosis.store import Store
 from pup.diagnosis.tracing import traces
 from pup.physics.parameters import robot_space
@@ -45,6 +39,7 @@ def found(missing: Mapping[str, float], seed: int = 3) -> Diagnosis:
         ({f"coulomb_friction/torque@{SERVO}": 0.03}, "coulomb_friction", "torque"),
         ({f"backlash/gap@{SERVO}": 0.008, f"backlash/behind@{SERVO}": 1.0}, "backlash", "gap"),
         ({f"torque_speed_limit/slope@{SERVO}": 0.03}, "torque_speed_limit", "slope"),
+        ({f"cogging/sine@{SERVO}": 0.012, f"cogging/teeth@{SERVO}": 42.0}, "cogging", "sine"),
     ],
 )
 def test_a_concealed_effect_is_named_and_measured(
@@ -136,6 +131,15 @@ class TestNoise:
         assert noise.source == "repeats"
         assert noise.sigma[0] == pytest.approx(0.003, rel=0.1)
         assert noise.rho[0] < 0.2
+
+    def test_motions_that_go_otherwise_each_time_are_no_noise(self) -> None:
+        """Late commands that are late by another time: half of the time, ten times the noise."""
+        measured = Measured.of(BENCH, recordings({}, noise=0.003))
+        rng = np.random.default_rng(0)
+        errors = 0.003 * rng.normal(size=len(measured.values))
+        swung = 0.03 * rng.normal(size=len(measured.recordings))[measured.recording]
+        errors += np.where(measured.time % 2 < 1, swung * np.sin(20 * measured.time), 0.0)
+        assert noise_floor(measured, errors).sigma[0] == pytest.approx(0.003, rel=0.2)
 
     def test_without_repeats_it_is_assumed_from_what_flickers(self) -> None:
         runs = [replace(r, repeat_of=None) for r in recordings({}) if r.id != "step_1"]

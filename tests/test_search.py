@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pup.diagnosis.fitting import Fit, nominal_coordinate
+from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Certificate, Nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
-from pup.diagnosis.residuals import Measured, assumed_noise
+from pup.diagnosis.residuals import Measured
 from pup.diagnosis.search import followed
 from pup.physics.parameters import robot_space
 from pup.recording import Recording

@@ -5,8 +5,9 @@ import pytest
 
 from pup.diagnosis.fitting import Fit, fit_together, nominal_coordinate
 from pup.diagnosis.hypotheses import MODERATE, Hypothesis, hypotheses
+from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.replays import Bench, Replays, threads
-from pup.diagnosis.residuals import Measured, assumed_noise
+from pup.diagnosis.residuals import Measured
 from pup.diagnosis.tracing import traces
 from pup.physics.parameters import robot_space
 from pup.recording import load_recordings

@@ -8,7 +8,15 @@ from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Model, Round
-from pup.diagnosis.verdict import doubt, left_over, probabilities, twins_of
+from pup.diagnosis.verdict import (
+    Finding,
+    doubt,
+    in_order,
+    left_over,
+    probabilities,
+    twins_of,
+)
+from pup.physics.terms import Place
 from tests.diagnosis_cases import BENCH, recordings
 
 MEASURED = Measured.of(BENCH, recordings({}))
@@ -64,3 +72,21 @@ def test_noise_that_is_not_well_known_is_no_reason_to_doubt() -> None:
     assert doubt(gained, left_over(model, sure)) > 0.15
     assert doubt(gained, left_over(model, unsure)) == pytest.approx(0.03)
     assert doubt(gained / 100, left_over(model, sure)) > doubt(gained, left_over(model, sure))
+
+
+def found(effect: str, gain: float, size: float, probability: float = 0.9) -> Finding:
+    place = Place("joint", BENCH.joint_names[0])
+    return Finding(effect, place, "", (), {}, probability, (), {}, None, gain, size)
+
+
+def test_what_every_robot_has_a_little_of_comes_after_what_is_of_a_usual_size() -> None:
+    """However much of the error is its: a clock that is off by a little moves everything."""
+    clock, ripple = found("clock_skew", 8000.0, 0.2), found("cogging", 400.0, 0.4)
+    nameless = found("unknown", 100.0, np.inf)
+    assert in_order([clock, ripple, nameless]) == (ripple, nameless, clock)
+
+
+def test_findings_stand_by_what_they_explain_where_none_is_of_a_usual_size_for_sure() -> None:
+    clock, ripple = found("clock_skew", 8000.0, 0.2), found("cogging", 400.0, 0.4, 0.3)
+    nameless = found("unknown", 100.0, np.inf)
+    assert in_order([nameless, ripple, clock]) == (clock, ripple, nameless)

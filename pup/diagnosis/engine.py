@@ -19,16 +19,17 @@ from pup.diagnosis.experiment import (
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
+from pup.diagnosis.noise import assumed_noise, quiet_noise
 from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.poor import Poor, why_poor
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
-from pup.diagnosis.residuals import Measured, Noise, assumed_noise, quiet_noise
+from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.search import Search, followed, search
 from pup.diagnosis.selection import Model, Round, Selector
 from pup.diagnosis.splits import Split, splits
-from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out
+from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out, in_order
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
@@ -193,7 +194,7 @@ def diagnose(
     progress("next recording", 0.95)
     ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
     every = (*named, left.finding) if left else named
-    evidence["findings"] = tuple(sorted(every, key=lambda finding: -finding.gain))
+    evidence["findings"] = in_order(every)
     return told("mismatch", ask=ask, **evidence)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.locate import MissingInput
-from pup.diagnosis.residuals import Measured, repeats
+from pup.diagnosis.noise import repeats
+from pup.diagnosis.residuals import Measured
 
 Array = NDArray[np.float64]
 

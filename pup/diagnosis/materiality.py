@@ -79,5 +79,4 @@ def _explains(nominal: Model, model: Model) -> bool:
 
 def _largest(model: Model) -> float:
     """Size of the effect that is largest, next to what is typical of its kind."""
-    at = dict(zip(model.fit.names, model.fit.at, strict=True))
-    return max((abs(at[n]) for h in model.hypotheses for n in h.magnitudes), default=0.0)
+    return max((model.size(h) for h in model.hypotheses), default=0.0)

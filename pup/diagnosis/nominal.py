@@ -18,8 +18,9 @@ from pup.diagnosis.fitting import (
     nominal_coordinate,
     start_best,
 )
+from pup.diagnosis.noise import noise_floor
 from pup.diagnosis.replays import Replays
-from pup.diagnosis.residuals import Noise, noise_floor
+from pup.diagnosis.residuals import Noise
 from pup.physics.parameters import ParameterSpace
 
 Array = NDArray[np.float64]

@@ -78,6 +78,11 @@ class Model:
         """Samples that it was fitted to."""
         return 0 if self.fit.residual is None else len(self.fit.residual)
 
+    def size(self, hypothesis: Hypothesis) -> float:
+        """Size of the largest magnitude of one of its effects, in what is typical of its kind."""
+        at = dict(zip(self.fit.names, self.fit.at, strict=True))
+        return max(abs(float(at[name])) for name in hypothesis.magnitudes)
+
     @property
     def worth(self) -> float:
         """What it explains: half its chi-squared in sample, half out of it, and its complexity."""

@@ -31,6 +31,8 @@ DOUBT = 0.2
 """Where this share of what is to be explained is left, a name is as likely wrong as right."""
 SURE = 1.645
 """Standard deviations of the noise floor that a model may leave beyond it."""
+SLIGHT = 0.25
+"""Share of its typical size below which an effect is what every robot has a little of."""
 WORTH_SAYING = 0.03
 """Alternatives less probable than this are not told."""
 TWIN = 0.995
@@ -71,6 +73,13 @@ class Finding:
     law: str | None
     gain: float = 0.0
     """Drop of chi-squared that it alone is worth."""
+    size: float = np.inf
+    """Of its largest magnitude, in what is typical of its kind; infinite of what has no kind."""
+
+    @property
+    def believed(self) -> bool:
+        """Whether it or what it cannot be told from is more likely there than not."""
+        return self.probability + sum(e.probability for e in self.equivalents) > 0.5
 
 
 @dataclass(frozen=True)
@@ -176,9 +185,20 @@ def findings(
                 absorbed_by=_absorbed(nominal, final),
                 law=EQUATIONS[hypothesis.effect],
                 gain=gain,
+                size=final.size(hypothesis),
             )
         )
-    return tuple(sorted(told, key=lambda f: -f.gain))
+    return in_order(told)
+
+
+def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Findings, most important first: by what they explain.
+
+    Beside an effect of a usual size, those of which every robot has a little come after, however
+    much of the error is theirs: a clock that is off by a little moves everything.
+    """
+    usual = any(f.effect != "unknown" and f.believed and f.size >= SLIGHT for f in found)
+    return tuple(sorted(found, key=lambda f: (usual and f.size < SLIGHT, -f.gain)))
 
 
 def reaches(model: Model) -> Array:

@@ -326,7 +326,8 @@ class Cogging(Term):
     quantities = (
         Quantity("sine", "N m", 0.03, 0.4, signed=True),
         Quantity("cosine", "N m", 0.03, 0.4, signed=True),
-        Quantity("teeth", "1", 24.0, 200.0, grid=(8.0, 12.0, 16.0, 24.0, 32.0, 48.0)),
+        # A joint that visits 2 rad tells numbers of teeth apart that differ by 3 (a sinc's lobe).
+        Quantity("teeth", "1", 24.0, 200.0, grid=tuple(np.arange(8.0, 61.0, 4.0).tolist())),
     )
     source = "estimate: 0.02 to 0.06 N m"
 
