@@ -29,7 +29,7 @@ from services.gateway.config import DATABASE_FILE, PREFIX, Config
 FILE = ROOT / "deploy/docker/Dockerfile"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 TARGETS = ("cluster", "gateway", "agent")
-HEAVY = {"ray", "torch", "jax", "mujoco"}
+HEAVY = {"ray", "torch", "jax", "mujoco", "numba"}
 SETTINGS = {PREFIX + field.upper() for field in Config.__dataclass_fields__} | {DATABASE_FILE}
 PORTS = {
     "gateway": {Config.port, LINK},

@@ -85,7 +85,7 @@ class Law:
         return jnp.where(free, torque, limit), jnp.where(free, damping, 0.0)
 
     def outside(self, servos: Servos, last: Last, velocity: Any) -> Any:
-        """Torque beside the servos', N m, NaN before the first sub-step; see LimitedLaw."""
+        """Torque beside the servos', N m, NaN before the first sub-step; see kernels.limit."""
         gained = velocity - last.velocity
         met = last.velocity + gained * self._share(servos)
         return gained * servos.inertia / servos.timestep + last.damping * met - last.torque

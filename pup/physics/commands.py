@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics import kernels
 from pup.physics.simulator import Schedule
 from pup.physics.terms.base import begin
 
@@ -78,7 +79,7 @@ class Commands(HeldCommands):
     """
 
     def __init__(self, plans: Sequence[Schedule], timestep: float) -> None:
-        self.timestep = timestep
+        self.timestep: float = timestep
         told = [_changes(plan) for plan in plans]
         ticks = max(len(time) for time, _ in told)
         self.time = np.full((len(plans), ticks + 1), np.inf)
@@ -101,9 +102,6 @@ class Commands(HeldCommands):
         first = np.arange(len(plans)) * ticks
         self._flat = self.held.reshape(-1, joints)
         self._at, self._from = first + rows[1:], first + rows[:-1]
-        self._first = first[:, None, None]
-        self._cell = (np.arange(len(plans)) * self._last.shape[1])[:, None, None]
-        self._joints = np.arange(joints)
         since = (ends[1:, None] - np.take_along_axis(self.time.T, rows[1:], axis=0)) / timestep
         recordings = np.arange(len(plans))
         changed = self.held[recordings, rows[1:]] != self.held[recordings, rows[:-1]]
@@ -120,12 +118,19 @@ class Commands(HeldCommands):
         return Target(now, before, share)
 
     def _held_at(self, time: Array) -> tuple[Array, Array]:
-        n = len(time)
-        cell = np.minimum(np.maximum((time / self.timestep).astype(np.int64), 0), self.steps)
-        row = self._first[:n] + self._last.take(self._cell[:n] + cell)
-        row += self.time.take(row + 1) <= time
-        held = self.held.take(row * len(self._joints) + self._joints)
-        return held, self.time.take(row)
+        recordings, candidates, _ = time.shape
+        flat, told = time.reshape(recordings, -1), np.empty(time.shape)
+        held = np.empty((recordings, candidates, self._flat.shape[1]))
+        kernels.look_up(
+            held.reshape(recordings, -1),
+            told.reshape(recordings, -1),
+            flat,
+            self._flat,
+            self.time,
+            self._last,
+            self.timestep,
+        )
+        return held, told
 
 
 class LiveCommands(HeldCommands):

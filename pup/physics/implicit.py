@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics import kernels
+
 Array = NDArray[np.float64]
 
 
@@ -18,5 +20,4 @@ def implicit_share(damping: Array, inertia: Array, timestep: float | Array) -> A
       inertia: what they brake, same shape, kg m².
       timestep: s; one for all, or broadcastable to the rest.
     """
-    x = np.maximum(damping * (timestep / inertia), 1e-6)
-    return np.asarray(-1 / np.expm1(-x) - 1 / x)
+    return np.asarray(kernels.implicit_share(damping, inertia, timestep))

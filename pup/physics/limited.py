@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics import kernels
 from pup.physics.actuators import TorqueLaw
 from pup.physics.implicit import implicit_share
-from pup.physics.terms.base import begin
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,10 @@ class LimitedLaw:
         self.inertia = inertia
         self.viscous = viscous
         self.timestep = np.broadcast_to(timestep, (len(inertia), 1)).copy()
-        self._last: tuple[Array, Array, Array] | None = None
-        self._starting = False
+        # Velocity, torque and damping; a torque that is NaN has not acted yet.
+        still = np.zeros_like(inertia)
+        self._last = still.copy(), np.full_like(inertia, np.nan), still.copy()
+        self._level = still
         self.derive()
 
     def derive(self) -> None:
@@ -42,7 +44,8 @@ class LimitedLaw:
             own = self.law.unlimited(still, still)[1]
             self._share = implicit_share(own, self.inertia, self.timestep)
             self._free, self._held = self._damped(own), self._damped(still)
-        self._reach = self._share / self._inertia
+        self._most = np.broadcast_to(self.law.limit, self.inertia.shape).copy()
+        self._least = -self._most
 
     def _damped(self, servo: Array) -> tuple[Array, Array]:
         """All damping with some of the servos, and the share that a sub-step takes implicitly."""
@@ -60,30 +63,44 @@ class LimitedLaw:
           The applied torque (N m) and the viscous coefficient that the engine shall take
           implicitly (N m s/rad), both of that shape.
         """
-        torque, damping = self.answer(error, velocity, self.outside(velocity))
+        torque, damping = self.answer(error, velocity)
         self.keep(velocity, torque, damping)
-        damping = damping + self.viscous
-        share = self.implicit(damping)
-        if share is not None:
-            torque = torque - (1 - share) * (damping * velocity)
-            damping *= share
+        brake, viscous = self.split(torque, damping, velocity)
+        return torque - brake, damping + viscous
+
+    def answer(self, error: Array, velocity: Array) -> tuple[Array, Array]:
+        """The law's torque and viscous coefficient, clipped; clipped, nothing is left to damp."""
+        torque, damping = self.law.unlimited(error, velocity)
+        self.limit(torque, damping, velocity, self._most, self._least, self._level)
         return torque, damping
 
-    def answer(self, error: Array, velocity: Array, outside: Array | None) -> tuple[Array, Array]:
-        """The law's torque and viscous coefficient, clipped; `outside` as `outside` tells it."""
-        torque, damping = self.law.unlimited(error, velocity)
-        limit = self.law.limit[: len(error)]
-        clip(torque, damping, self.ahead(torque, damping, velocity, outside), limit)
-        return torque, damping
+    def limits(self, n: int) -> tuple[Array, Array, Array]:
+        """Largest and smallest torque of the first n simulations and their slope, to be changed."""
+        return self._most[:n].copy(), self._least[:n].copy(), self._level[:n].copy()
+
+    def limit(
+        self,
+        torque: Array,
+        damping: Array,
+        velocity: Array,
+        upper: Array,
+        lower: Array,
+        slope: Array,
+    ) -> None:
+        """Keep a torque and its damping within limits, in place; see kernels.limit."""
+        kernels.limit(
+            torque, damping, velocity, upper, lower, slope, *self._last, self._share, self._inertia
+        )
 
     def keep(self, velocity: Array, torque: Array, damping: Array) -> None:
         """Note what a sub-step applies, for the next one."""
-        self._last = velocity.copy(), torque, damping
-        self._starting = False
+        n = len(velocity)
+        before, acted, damped = self._last
+        before[:n], acted[:n], damped[:n] = velocity, torque, damping
 
     def begin(self) -> None:
         """Let all simulations start: nothing is known of what has acted before."""
-        self._last = None
+        self._last[1][:] = np.nan
 
     def renew(
         self,
@@ -106,83 +123,53 @@ class LimitedLaw:
           velocity: of their joints, shape (n_rows, n_joints), rad/s.
           torque: that has acted before, N m; NaN as in a replay, where nothing is known of it.
         """
-        if self._last is None:
-            still = np.zeros_like(self.inertia)
-            self._last = still, still.copy(), still.copy()
-        before, acted, damping = self._last
-        before[rows], acted[rows], damping[rows] = velocity, torque, 0.0
-        self._starting = True
+        before, acted, damped = self._last
+        before[rows], acted[rows], damped[rows] = velocity, torque, 0.0
 
     def state(self) -> dict[str, Array]:
         """What the next sub-step depends on: velocity, torque and damping of the last one."""
-        assert self._last is not None
         return {name: a.copy() for name, a in zip(_KEPT, self._last, strict=True)}
 
     def restore(self, state: dict[str, Array]) -> None:
         """Take up a state."""
-        before, torque, damping = (state[name].copy() for name in _KEPT)
-        self._last = before, torque, damping
-        self._starting = True
+        for kept, name in zip(self._last, _KEPT, strict=True):
+            kept[:] = state[name]
 
     def acted(self, velocity: Array) -> Array:
         """The servos' torques over the last sub-step, N m, which ended at a velocity."""
-        assert self._last is not None
         _, torque, damping = self._last
         return np.asarray(torque - damping * velocity)
 
-    def outside(self, velocity: Array) -> Array | None:
-        """Torque beside the servos', N m, by what the last sub-step did; None before the first."""
-        if self._last is None:
-            return None
-        n = len(velocity)
-        before, torque, damping = (a[:n] for a in self._last)
-        gained = velocity - before
-        met = velocity  # by what is taken implicitly
-        if self.law.steady:
-            met = gained * self._share[:n]
-            met += before
-        braked = damping * met
-        gained *= self._inertia[:n]
-        gained += braked
-        gained -= torque
-        return gained
+    def split(
+        self, torque: Array, damping: Array, velocity: Array, still: bool = False
+    ) -> tuple[Array, Array]:
+        """Apply as it is what of the damping a sub-step does not take implicitly.
 
-    def ahead(self, torque: Array, damping: Array, velocity: Array, outside: Array | None) -> Array:
-        """The velocity that damping meets in a sub-step, by each joint's own inertia.
+        Args:
+          torque: of the servos, N m; changed in place.
+          damping: of the servos, N m s/rad; to what is taken implicitly, in place.
+          velocity: of the joints, rad/s.
+          still: take nothing implicitly.
 
-        Whether a servo is at its limit is decided by it. Decided by the velocity that is, a servo
-        would leave its limit with a jump of its torque, by what a sub-step changes of the damping,
-        and trajectories would jump with whatever moves that moment past a sub-step's end. Stiff
-        damping brakes within the sub-step: velocities that only go on as they did would mislead.
+        Returns:
+          The same of the damping outside the servos: torque against theirs, and what is implicit.
         """
-        if outside is None:
-            return velocity
-        reach = self._reach[: len(velocity)]
-        ahead = torque + outside
-        ahead *= reach
-        ahead += velocity
-        slower = reach * damping
-        slower += 1
-        ahead /= slower
-        if self._starting:
-            begin(ahead, velocity)
-        return ahead
-
-    def implicit(self, damping: Array) -> Array | None:
-        """Share of a damping that the engine takes implicitly; None where it takes all of it."""
-        if not self.law.steady:
-            return None
-        n = len(damping)
-        free, held = self._free[0][:n], self._held[0][:n]
-        off_limit = damping == free
-        if (off_limit | (damping == held)).all():  # as it mostly is, without exponentials
-            return np.where(off_limit, self._free[1][:n], self._held[1][:n])
-        return implicit_share(damping, self.inertia[:n], self.timestep[:n])
-
-
-def clip(torque: Array, damping: Array, ahead: Array, limit: Array) -> None:
-    """Clip `torque - damping * ahead` to ±limit, in place; clipped, nothing is left to damp."""
-    total = torque - damping * ahead
-    clipped = ~(np.abs(total) < limit)
-    np.copysign(limit, total, out=torque, where=clipped)
-    np.copyto(damping, 0.0, where=clipped)
+        viscous = self.viscous[: len(velocity)].copy()
+        brake = np.zeros(viscous.shape)
+        if still:
+            torque -= damping * velocity
+            brake += viscous * velocity
+            damping[:], viscous[:] = 0.0, 0.0
+        elif self.law.steady:
+            kernels.split(
+                torque,
+                damping,
+                brake,
+                viscous,
+                velocity,
+                *self._free,
+                *self._held,
+                self.inertia,
+                self.timestep,
+            )
+        return brake, viscous

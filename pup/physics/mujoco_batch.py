@@ -30,13 +30,10 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 
 SIMULATIONS = 512
-"""Simulations in a batch: enough to hide NumPy's overhead, few enough to stay in cache."""
+"""Simulations in a batch: enough to hide what calls cost, few enough to stay in cache."""
 
-_BROKEN = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-]
+_BROKEN = slice(mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC + 1)
+"""Warnings of broken positions, velocities and accelerations."""
 
 
 @dataclass(frozen=True)
@@ -222,6 +219,7 @@ class Run:
         self.push = None if push is None else Pushing(push, group.model, robot.timestep)
         self.ids = np.arange(nsim, dtype=np.int32)
         self.broken = np.zeros(nsim, dtype=bool)
+        self.warned = self.batch.warning[:, _BROKEN, 1]
         self._start(nsim)
         self.joints = History(nsim, len(robot.joints), self._age("delay"))
         self.feet = [group.model.compiled.body(foot).id for foot in robot.feet]
@@ -362,12 +360,12 @@ class Run:
         _write(out.feet, part, event, self._sound(rows, self.places[rows][:, self.feet]))
 
     def _rows(self, event: Event) -> tuple[NDArray[np.int64], Array]:
-        rows = (event.rows[:, None] * self.candidates + np.arange(self.candidates)).ravel()
-        return rows, np.repeat(event.fraction, self.candidates)[:, None]
+        rows = (event.rows[:, None] * self.candidates + self.ids[: self.candidates]).ravel()
+        return rows, event.fraction.repeat(self.candidates)[:, None]
 
     def _sound(self, rows: NDArray[np.int64], values: Array) -> Array:
         """The values, NaN for simulations that have broken down."""
-        lost = self.broken[rows] | (self.batch.warning[rows, :, 1][:, _BROKEN] > 0).any(axis=1)
+        lost = self.broken[rows] | (self.warned[rows] > 0).any(axis=1)
         values[lost] = np.nan
         return values
 

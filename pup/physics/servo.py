@@ -8,6 +8,7 @@ of these. Without any, this is the torque law alone.
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics import kernels
 from pup.physics.commands import HeldCommands, Target
 from pup.physics.limited import LimitedLaw
 from pup.physics.outfit import Outfit
@@ -41,6 +42,7 @@ class Servos:
         self.limited = LimitedLaw(self.law, self.scene.inertia, self.viscous, self.scene.timestep)
         self.commands = commands
         self.power = None if power is None or (power == 1).all() else power
+        self.partly = np.zeros(0) if power is None else (power != 1).any(axis=1)
         self.delay = None if delay is None else delay[:, None]
         self.candidates = candidates
 
@@ -78,7 +80,8 @@ class Servos:
           step: the sub-step; where simulations have one each, shape (n_simulations, 1).
           link: positions (rad) and velocities (rad/s) of the links, each (n_active, n_joints).
           sensed: the same as the encoders tell them.
-          still: damp by the velocities that are, not by those at the sub-step's end.
+          still: damp by the velocities that are, not by those at the sub-step's end; to try a
+            first sub-step, before which nothing has acted.
 
         Returns:
           The applied torque (N m) and the viscous coefficient (N m s/rad), both of that shape.
@@ -86,68 +89,39 @@ class Servos:
         time: float | Array = step * self.scene.timestep
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
-        outside = None if still else self.limited.outside(sensed[1])
-        error, torque, damping = self._answer(target.now, sensed, outside)
+        error, torque, damping = self._answer(target.now, sensed)
         if target.before is not None:
             share = self._spread(target.share, running)
-            old, was, damped = self._answer(target.before, sensed, outside)
-            error = share * error + (1 - share) * old
-            torque = share * torque + (1 - share) * was
-            damping = share * damping + (1 - share) * damped
+            old, was, damped = self._answer(target.before, sensed)
+            kernels.blend(error, torque, damping, old, was, damped, share)
         own = self.law.unlimited(error, sensed[1])[1] if self.needs_law_damping else None
-        if self.power is not None:
-            on = self._on(self.power, step, running, time)
+        on = self._on(step, running, time)
+        if on is not None:
             torque *= on
             damping *= on
             own = None if own is None else own * on
-        if not still:
-            self.limited.keep(sensed[1], torque, damping)
+        self.limited.keep(sensed[1], torque, damping)
         for term in self.settling:
             term.settle(error, torque - damping * sensed[1])
+        brake, viscous = self.limited.split(torque, damping, sensed[1], still)
         if self.flowing:
-            return self._through_gears(time, link, sensed[1], own, (torque, damping), still)
-        damping = damping + self.viscous[: len(damping)]
-        implicit = self._implicit(damping, still)
-        if implicit is not None:
-            torque = torque - (1 - implicit) * (damping * sensed[1])
-            damping *= implicit
-        return torque, damping
+            now = link[1]
+            before = now if self.before is None else self.before[: len(now)]
+            self.before = now.copy()
+            coming = 2 * now - before
+            flow = Flow(time, *link, coming, own, torque, damping, brake, viscous)
+            for term in self.flowing:
+                term.flow(flow)
+        return torque - brake, damping + viscous
 
-    def _implicit(self, damping: Array, still: bool) -> Array | None:
-        """Share of a damping that the engine takes implicitly; None where it takes all of it."""
-        if still:
-            return np.zeros_like(damping)
-        return self.limited.implicit(damping)
+    def _on(self, step: int | Array, running: int, time: float | Array) -> Array | None:
+        """Share of a sub-step with the torque on, which is switched by the commands' clock.
 
-    def _through_gears(
-        self,
-        time: float | Array,
-        link: tuple[Array, Array],
-        sensed: Array,
-        law_damping: Array | None,
-        driven: tuple[Array, Array],
-        still: bool,
-    ) -> tuple[Array, Array]:
-        """What of the torque and damping of a servo reaches the links; see `torque`."""
-        torque, damping = (a.copy() for a in driven)  # gears change them in place
-        viscous, brake = self.viscous[: len(damping)], np.zeros_like(torque)
-        share = self._implicit(damping + viscous, still)
-        if share is not None:
-            torque -= (1 - share) * (damping * sensed)
-            damping *= share
-            brake = (1 - share) * (viscous * sensed)
-            viscous = share * viscous
-        now = link[1]
-        before = now if self.before is None else self.before[: len(now)]
-        self.before = now.copy()
-        coming = 2 * now - before
-        flow = Flow(time, *link, coming, law_damping, torque, damping, brake, viscous)
-        for term in self.flowing:
-            term.flow(flow)
-        return flow.torque - flow.brake, flow.damping + flow.viscous
-
-    def _on(self, power: Array, step: int | Array, running: int, time: float | Array) -> Array:
-        """Share of a sub-step with the torque on, which is switched by the commands' clock."""
+        None where it is on in all simulations.
+        """
+        power = self.power
+        if power is None or not (self.clocks or self.partly[step]):
+            return None
         if not self.clocks:
             return np.repeat(power[step, :running], self.candidates)[:, None]
         lateness = sum(term.lateness(time, running * self.candidates) for term in self.clocks)
@@ -180,14 +154,13 @@ class Servos:
         """Values per recording and candidate or for all candidates, for each simulation."""
         if values.ndim != 3:
             return values
-        full = np.broadcast_to(values, (running, self.candidates, values.shape[2]))
+        full = values.repeat(self.candidates // values.shape[1], axis=1)
         return full.reshape(running * self.candidates, -1)
 
     def _answer(
         self,
         target: Array,
         sensed: tuple[Array, Array],
-        outside: Array | None,
     ) -> tuple[Array, Array, Array]:
         """The law's error, torque and viscous coefficient for one target."""
         position, velocity = sensed
@@ -199,23 +172,10 @@ class Servos:
         for term in self.erring:
             error = term.error(error)
         if not self.driving:
-            return error, *self.limited.answer(error, velocity, outside)
+            return error, *self.limited.answer(error, velocity)
         torque, damping = self.law.unlimited(error, velocity)
-        limit = self.law.limit[: len(error)]
-        upper = np.broadcast_to(limit, error.shape).copy()
-        slope = np.zeros_like(upper)
-        drive = Drive(error, velocity, torque, damping, upper, -upper, slope)
+        drive = Drive(error, velocity, torque, damping, *self.limited.limits(len(error)))
         for term in self.driving:
             term.drive(drive)
-        ahead = self.limited.ahead(drive.torque, drive.damping, velocity, outside)
-        _clip_between(drive, ahead)
-        return error, drive.torque, drive.damping
-
-
-def _clip_between(drive: Drive, ahead: Array) -> None:
-    """The same between two limits of their own; what falls with speed at a limit damps there."""
-    total = drive.torque - drive.damping * ahead
-    above, below = ~(total < drive.upper), ~(total > drive.lower)
-    for limit, beyond in ((drive.upper, above), (drive.lower, below)):
-        np.copyto(drive.torque, limit + drive.slope * drive.velocity, where=beyond)
-        np.copyto(drive.damping, drive.slope, where=beyond)
+        self.limited.limit(torque, damping, velocity, drive.upper, drive.lower, drive.slope)
+        return error, torque, damping

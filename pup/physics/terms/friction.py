@@ -3,18 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics import kernels
 from pup.physics.terms.base import Flow, Quantity, Term
 
 Array = NDArray[np.float64]
 
 GRIP = 5e-5
 """How far a joint gives before dry friction slips, rad: what no encoder of a servo would see."""
-FIRMEST = 2.0
-"""Squared phase of a joint that swings on its bristle, in a sub-step, from which it is softened."""
-HARDLY = 1e-4
-"""Slip, as a share of a bristle's length, that bends it in proportion."""
-LEAST = 1e-30
-"""Slip that is none."""
 
 
 class Friction(Term):
@@ -31,6 +26,8 @@ class Friction(Term):
         """See Term."""
         self._bend = np.zeros_like(self.scene.inertia)  # as a share of where it slips
         self._load: Array | None = None
+        self._length = self.length()
+        self._step = np.ones((len(self._bend), 1)) * self.scene.timestep
 
     def held(self, load: Array, gravity: Array) -> Array:
         """See Term: a joint that is found at rest has its bristle bent by what it holds."""
@@ -41,37 +38,29 @@ class Friction(Term):
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n, step = len(flow.torque), self.scene.timestep
         level = self.level(flow)
         if self._load is not None:
             self._bend[:] = np.clip(-self._load / np.maximum(level, 1e-9), -1.0, 1.0)
             self._load = None
-        inertia = self.scene.inertia[:n]
-        length = np.maximum(self.length(n), level * step**2 / (FIRMEST * inertia))
-        half = step / 2 / length
-        way, bend = np.sign(flow.velocity), self._bend[:n]
-        mean, kept = _half(np.abs(flow.velocity) * half)
-        middle = way + (bend - way) * kept
-        bend[:] = way + (middle - way) * kept
-        coming = np.maximum(np.abs(flow.coming) * half, HARDLY)
-        ahead, _ = _half(coming)
-        flow.torque -= level / 2 * (way + (middle - way) * mean + bend * ahead)
-        flow.damping += level / 2 * (1 - ahead) / coming * half
+        kernels.rub(
+            flow.torque,
+            flow.damping,
+            self._bend,
+            flow.velocity,
+            flow.coming,
+            level,
+            self._length,
+            self.scene.inertia,
+            self._step,
+        )
 
     def level(self, flow: Flow) -> Array:
         """Friction torque of a joint that slips, N m."""
         raise NotImplementedError
 
-    def length(self, n: int) -> Array | float:
-        """How far a joint gives before it slips, rad."""
-        return GRIP
-
-
-def _half(slip: Array) -> tuple[Array, Array]:
-    """What a bend keeps of itself over a half sub-step's slip, in the mean and at its end."""
-    slip = np.maximum(slip, LEAST)
-    lost = np.expm1(-slip)
-    return -lost / slip, 1 + lost
+    def length(self) -> Array:
+        """How far a joint gives before it slips, (n_simulations, n_joints), rad."""
+        return np.full_like(self.scene.inertia, GRIP)
 
 
 class CoulombFriction(Friction):
@@ -122,9 +111,9 @@ class PreslidingHysteresis(Friction):
         """See Friction."""
         return self.values["torque"][: len(flow.torque)]
 
-    def length(self, n: int) -> Array:
+    def length(self) -> Array:
         """See Friction."""
-        return self.values["deflection"][:n]
+        return self.values["deflection"]
 
 
 class LoadDependentFriction(Friction):

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.physics import kernels
 from pup.physics.implicit import implicit_share
-from pup.physics.terms.base import Flow, Quantity, Scene, Term, begin
+from pup.physics.terms.base import Flow, Quantity, Scene, Term
 from pup.physics.writer import FieldWriter
 
 Array = NDArray[np.float64]
@@ -87,6 +88,7 @@ class Drivetrain(Term):
     def prepare(self) -> None:
         """See Term."""
         step = self.scene.timestep
+        self._step = np.ones((len(self._gap), 1)) * step
         self._rotor = np.maximum(self.scene.armature, 1e-7) / step
         stiffness = 1 / np.maximum(self._give, 1e-9)
         self._reach, self._past = spring_shares(stiffness, self._rotor * step, step)
@@ -105,19 +107,26 @@ class Drivetrain(Term):
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
-        n = len(position)
-        own, speed = self._position[:n], self._velocity[:n]
-        carried = self._torque[:n] - self._damping[:n] * velocity
-        speed[:] = self._free[:n] - carried / self._heft[:n]
-        np.copyto(speed, self._first[:n], where=np.isnan(own))
-        np.copyto(speed, velocity, where=np.isnan(speed))
-        own += self.scene.timestep * speed
-        begin(own, position)
-        active, gap = self._active[:n], self._gap[:n]
-        ahead = own - position
-        play = np.clip(ahead, -gap, gap)
-        told = position + self._play_seen[:n] * play + self._bend_seen[:n] * (ahead - play)
-        return np.where(active, told, position), np.where(active, self._velocity[:n], velocity)
+        told, felt = np.empty(position.shape), np.empty(position.shape)
+        kernels.follow(
+            told,
+            felt,
+            position,
+            velocity,
+            self._position,
+            self._velocity,
+            self._free,
+            self._heft,
+            self._torque,
+            self._damping,
+            self._first,
+            self._active,
+            self._gap,
+            self._play_seen,
+            self._bend_seen,
+            self._step,
+        )
+        return told, felt
 
     def tried(self, position: Array, velocity: Array, before: Array) -> None:
         """Learn from a first sub-step how fast the motors are half a sub-step before the start.
@@ -132,25 +141,27 @@ class Drivetrain(Term):
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n, step = len(flow.torque), self.scene.timestep
-        active, gap, heft, reach = self._active[:n], self._gap[:n], self._heft[:n], self._reach[:n]
-        rotor = self._rotor[:n]
-        heft[:] = rotor + flow.damping + flow.viscous
-        pull = flow.torque - flow.brake
-        self._free[:n] = (rotor * self._velocity[:n] + pull) / heft
-        ahead = self._position[:n] - flow.position
-        coming = ahead + step * (self._free[:n] - flow.velocity)
-        touching = np.abs(coming) >= gap
-        grip = reach / (self._give[:n] + reach / heft)
-        beyond = ahead - np.copysign(gap, coming)
-        beyond += self._past[:n] * (self._velocity[:n] - flow.velocity)
-        torque = np.where(touching, grip * (beyond / reach + self._free[:n]), 0.0)
-        damping = np.where(touching, grip, 0.0)
-        self._torque[:n], self._damping[:n] = torque, damping
-        np.copyto(flow.torque, torque, where=active)
-        np.copyto(flow.damping, damping, where=active)
-        flow.brake = np.where(active, 0.0, flow.brake)
-        flow.viscous = np.where(active, 0.0, flow.viscous)
+        kernels.engage(
+            flow.torque,
+            flow.damping,
+            flow.brake,
+            flow.viscous,
+            flow.position,
+            flow.velocity,
+            self._position,
+            self._velocity,
+            self._free,
+            self._heft,
+            self._torque,
+            self._damping,
+            self._active,
+            self._gap,
+            self._give,
+            self._rotor,
+            self._reach,
+            self._past,
+            self._step,
+        )
 
 
 class Backlash(Transmission):
