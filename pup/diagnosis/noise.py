@@ -1,11 +1,13 @@
 """The noise floor: what differs between repeats of a motion, else what flickers at rest."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from pup.diagnosis.residuals import Measured, Noise
 from pup.physics.terms.scale import Scale
@@ -25,15 +27,19 @@ NORMAL_CUT = 0.965
 """Mean square of a normal variable whose squares are cut at their 98 % quantile."""
 BLOCK = 0.5
 """Errors are looked at in blocks of this length to tell noise from what a model lacks, s."""
-PER_BLOCK = 15
-"""Readings in such a block of what differs between repeats."""
 FEWEST_BLOCKS = 8
 """Blocks of a channel below which they tell nothing of its noise."""
 QUIET = 2.5
 """Blocks with more than so many times the usual mean square are not noise alone."""
-CALMEST, UNEVEN = 0.25, 6.0
-"""Where repeats differ by so many times the variance of this share of their blocks, the calmest,
-what differs is more than noise."""
+EVIDENCE = 30.0
+"""Logarithm of odds from which repeats are believed to come at other times; errors that follow each
+other count as independent in it."""
+ROUNDS = 20
+"""Of weighted least squares, of which a few settle it."""
+SLOW = 0.25
+"""Share of the differences, the slowest, that tell the noise at rest."""
+NORMAL_MIDDLE = 0.455
+"""Median of a normal variable's squares."""
 DIGITS = 6
 """Decimals of a radian that readings are told apart by."""
 ON_GRID, MOSTLY = 0.1, 0.9
@@ -59,21 +65,22 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
       errors: measured minus simulated, shape (n_samples,), rad.
     """
     pairs = repeats(measured)
-    differences = [_difference(measured, errors, a, b) for a, b in pairs]
-    ground = any(measured.recordings[a].support == "ground" for a, _ in pairs)
-    told, readings = {}, []
-    for channel in range(measured.channels):
-        parts = [d[channel] for d in differences if channel in d]
-        if parts:
-            told[channel] = _spread(parts if ground else _repeating(parts))
-            readings.append(sum(map(len, parts)))
+    differences = [d for a, b in pairs for d in _differences(measured, errors, a, b)]
+    told: dict[int, tuple[float, float]] = {}
+    readings, late = [], 0.0
+    if differences:
+        ground = any(measured.recordings[a].support == "ground" for a, _ in pairs)
+        told, late = _spreads(differences, uneven=not ground)
+        counts = np.bincount([d.channel for d in differences], [len(d.errors) for d in differences])
+        readings = [int(n) for n in counts if n]
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
     if not told:
         for channel in range(measured.channels):
             flicker = _flicker(measured, errors, channel)
             if flicker:
                 told[channel] = flicker
-    return _pooled(measured, told, source, int(np.median(readings)) if readings else 0)
+    noise = _pooled(measured, told, source, int(np.median(readings)) if readings else 0)
+    return replace(noise, late=late)
 
 
 def quiet_noise(measured: Measured, errors: Array) -> Noise:
@@ -133,19 +140,72 @@ def _pooled(
     return Noise(sigma, rho, source, readings)
 
 
-def _repeating(parts: Sequence[Array]) -> Sequence[Array]:
-    """Differences of repeats less those blocks of them in which the motion itself was another.
+def _spreads(
+    differences: Sequence["Difference"], uneven: bool
+) -> tuple[dict[int, tuple[float, float]], float]:
+    """Standard deviation and memory of each channel, and how late motions come, s.
 
-    Commands that come late by another time each time move a servo otherwise after every step, by
+    Commands that come late by another time each time move a joint otherwise wherever it moves, by
     many times the noise of its readings, and not at all at rest. On the ground, impacts make
-    motions differ everywhere, and no block tells the noise alone.
+    motions differ everywhere, and no rest tells the noise alone.
     """
-    blocks = [b for p in parts for b in np.array_split(p, max(1, len(p) // PER_BLOCK))]
-    squares = np.array([np.mean(block**2) for block in blocks])
-    calm = float(np.quantile(squares, CALMEST))
-    if len(blocks) < FEWEST_BLOCKS or np.mean(squares) <= UNEVEN * calm:
-        return parts
-    return [b for b, s in zip(blocks, squares, strict=True) if s < QUIET * calm]
+    channels = sorted({d.channel for d in differences})
+    by_channel = [[d for d in differences if d.channel == channel] for channel in channels]
+    if uneven:
+        column = np.concatenate(
+            [np.full(len(d.errors), channels.index(d.channel)) for d in differences]
+        )
+        variances, late = _lateness(
+            np.concatenate([d.errors for d in differences]) ** 2,
+            np.concatenate([d.speed for d in differences]) ** 2,
+            column,
+        )
+        if late:
+            scales = [
+                [np.sqrt(variance + (late * d.speed) ** 2) for d in own]
+                for variance, own in zip(variances, by_channel, strict=True)
+            ]
+            told = {}
+            for channel, variance, own, scale in zip(
+                channels, variances, by_channel, scales, strict=True
+            ):
+                _, rho = _spread([d.errors / s for d, s in zip(own, scale, strict=True)])
+                told[channel] = float(np.sqrt(variance)), rho
+            return told, late
+    return {
+        channel: _spread([d.errors for d in own])
+        for channel, own in zip(channels, by_channel, strict=True)
+    }, 0.0
+
+
+def _lateness(squares: Array, speeds: Array, column: NDArray[np.int64]) -> tuple[Array, float]:
+    """Variance of each channel at rest, and the time by which motions are late; 0 for none.
+
+    By iterated weighted least squares, which end where the likelihood of normal errors is largest.
+
+    Args:
+      squares: of differences, (n,), rad².
+      speeds: squared, (n,), (rad/s)².
+      column: which channel each is of, (n,).
+    """
+    alike = np.bincount(column, squares) / np.bincount(column)
+    design = np.column_stack([column == k for k in range(len(alike))] + [speeds]).astype(float)
+    slow = [
+        np.flatnonzero((column == k) & (speeds <= np.quantile(speeds[column == k], SLOW)))
+        for k in range(len(alike))
+    ]
+    variance, found = alike[column], np.r_[alike, 0.0]
+    for _ in range(ROUNDS):
+        # Where it is slow, a channel is as noisy as it shows there, but for the large among them.
+        middle = [np.median(squares[own] / variance[own]) / NORMAL_MIDDLE for own in slow]
+        least = found[:-1] * middle
+        found, _ = nnls(design / variance[:, None], squares / variance)
+        found[:-1] = np.maximum(found[:-1], least)
+        variance = design @ found
+    even = alike[column]
+    gain = float(np.sum(np.log(even / variance) + squares / even - squares / variance)) / 2
+    late = float(np.sqrt(found[-1]))
+    return (found[:-1], late) if gain > EVIDENCE else (alike, 0.0)
 
 
 def quanta(measured: Measured) -> Array:
@@ -199,9 +259,24 @@ def repeats(measured: Measured) -> list[tuple[int, int]]:
     return pairs
 
 
-def _difference(measured: Measured, errors: Array, a: int, b: int) -> dict[int, Array]:
-    """Half the difference of two repeats' errors by channel, of one recording's variance."""
-    out = {}
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Half the difference of two repeats' errors in one channel, of one recording's variance.
+
+    Attributes:
+      channel: which.
+      errors: shape (n,), rad.
+      speed: of the motion about them, shape (n,), rad/s.
+    """
+
+    channel: int
+    errors: Array
+    speed: Array
+
+
+def _differences(measured: Measured, errors: Array, a: int, b: int) -> list[Difference]:
+    """What differs between two repeats, by channel."""
+    out = []
     for channel in range(measured.channels):
         first = (measured.recording == a) & (measured.channel == channel)
         second = (measured.recording == b) & (measured.channel == channel)
@@ -216,7 +291,9 @@ def _difference(measured: Measured, errors: Array, a: int, b: int) -> dict[int, 
         told = errors[second]
         matched = (1 - share) * told[at] + share * told[at + 1]
         variance = 1 + (1 - share) ** 2 + share**2  # of the difference, in one reading's
-        out[channel] = (errors[first][inside] - matched) / np.sqrt(variance)
+        difference = (errors[first][inside] - matched) / np.sqrt(variance)
+        speed = np.sqrt((measured.speed[first][inside] ** 2 + measured.speed[second][at] ** 2) / 2)
+        out.append(Difference(channel, difference, speed))
     return out
 
 

@@ -25,6 +25,8 @@ SETTLING = 0.1
 """Time after a recording's start that is left out: its first readings carry noise too, s."""
 UNSURE = {"repeats": 0.05, "assumed": 0.15}
 """By what share a noise floor's variance may be wrong, however many readings tell it."""
+AROUND = 0.06
+"""Time before and after a sample whose speed is that of the motion about it, s."""
 LOST = 3.0
 """Error counted for a simulation that broke down, rad."""
 
@@ -38,12 +40,15 @@ class Noise:
       rho: its correlation from tick to tick, same shape.
       source: whether repeated recordings tell it or it is assumed.
       readings: differences of repeats that tell a channel's; 0 where none do.
+      late: standard deviation of the time by which motions come early or late when they are done
+        again, s: of errors that grow with the speed.
     """
 
     sigma: Array
     rho: Array
     source: Literal["repeats", "assumed"]
     readings: int = 0
+    late: float = 0.0
 
     @property
     def unsure(self) -> float:
@@ -114,6 +119,25 @@ class Measured:
         same = (np.diff(self.recording) == 0) & (np.diff(self.channel) == 0)
         return np.concatenate([[False], same])
 
+    @cached_property
+    def speed(self) -> Array:
+        """How fast each channel moves about each sample, shape (n_samples,), rad/s."""
+        told = np.zeros(len(self.values))
+        for run in np.split(np.arange(len(self.values)), np.flatnonzero(~self._follows)[1:]):
+            if len(run) < 2:
+                continue
+            time = self.time[run]
+            squares = np.gradient(self.values[run], time) ** 2
+            sums = np.concatenate([[0.0], np.cumsum(squares)])
+            first = np.searchsorted(time, time - AROUND)
+            last = np.searchsorted(time, time + AROUND, side="right")
+            told[run] = np.sqrt((sums[last] - sums[first]) / (last - first))
+        return told
+
+    def deviation(self, noise: Noise) -> Array:
+        """Standard deviation of each sample's noise, shape (n_samples,), rad."""
+        return np.hypot(noise.sigma[self.channel], noise.late * self.speed)
+
     def pick(self, trajectories: Trajectories) -> Array:
         """The trajectories at the samples, shape (n_candidates, n_samples); NaN where diverged."""
         n = len(trajectories.position)
@@ -123,9 +147,9 @@ class Measured:
     def whiten(self, errors: Array, noise: Noise) -> Array:
         """Errors (..., n_samples), rad, in units of uncorrelated noise."""
         rho = np.where(self._follows, noise.rho[self.channel], 0.0)
-        before = np.concatenate([errors[..., :1], errors[..., :-1]], axis=-1)
-        sigma = noise.sigma[self.channel] * np.sqrt(1 - rho**2)
-        return np.asarray((errors - rho * before) / sigma)
+        scaled = errors / self.deviation(noise)
+        before = np.concatenate([scaled[..., :1], scaled[..., :-1]], axis=-1)
+        return np.asarray((scaled - rho * before) / np.sqrt(1 - rho**2))
 
     def only(self, recordings: Sequence[int]) -> NDArray[np.bool_]:
         """Which samples are of some recordings."""

@@ -179,7 +179,8 @@ def findings(
                 place=hypothesis.place,
                 regime=strongest(found, squares),
                 when=tuple(windows(measured, squares)),
-                parameters=_parameters(hypothesis, final) | _uneven(hypothesis, final),
+                parameters=_parameters(hypothesis, final)
+                | _uneven(hypothesis, final, selector.noise),
                 probability=probability,
                 equivalents=rivals,
                 absorbed_by=_absorbed(nominal, final),
@@ -305,10 +306,22 @@ def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
     return told
 
 
-def _uneven(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
-    """By how much a delay changes from tick to tick, where it does."""
-    told = jitter(final) if hypothesis.family == "delay" else None
-    return {} if told is None else {"jitter": Parameter(told.spread, "s", told.lower, told.upper)}
+def _uneven(hypothesis: Hypothesis, final: Model, noise: Noise) -> dict[str, Parameter]:
+    """By how much a delay changes from tick to tick, where it does: what repeats tell, and more."""
+    if hypothesis.family != "delay":
+        return {}
+    more = jitter(final)
+    if more is None and not noise.late:
+        return {}
+    sure = 1 - 1.645 * noise.unsure / 2, 1 + 1.645 * noise.unsure / 2
+    ends = (more.lower, more.upper) if more else (0.0, 0.0)
+    return {
+        "jitter": Parameter(
+            float(np.hypot(noise.late, more.spread if more else 0.0)),
+            "s",
+            *(float(np.hypot(noise.late * s, e)) for s, e in zip(sure, ends, strict=True)),
+        )
+    }
 
 
 def _quantity(name: str, hypothesis: Hypothesis) -> str | None:
