@@ -146,6 +146,7 @@ class Selector:
         self.enough, self.most = enough, most
         self.folds = folds(replays)
         self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
+        self._lesser: tuple[Fit | None, list[Fit]] = None, []
         self.nominal = self.predicting(self.model((), nominal))
 
     def run(self, start: Model) -> tuple[Model, list[Round]]:
@@ -210,11 +211,14 @@ class Selector:
         """A fitted model with its predictions of the folds."""
         return self.models([(tuple(hypotheses), fit)])[0]
 
-    def without(self, model: Model, hypothesis: Hypothesis) -> Fit:
-        """The model refitted without one of its effects."""
-        fit = self._less(model, hypothesis)
-        fit_together([fit], self.replays, self.noise, iterations=ROUGH)
-        return fit
+    def without(self, model: Model) -> list[Fit]:
+        """The model refitted without each of its effects in turn."""
+        of, known = self._lesser
+        if of is not model.fit:  # what was asked last is mostly asked again
+            known = [self._less(model, h) for h in model.hypotheses]
+            fit_together(known, self.replays, self.noise, iterations=ROUGH)
+            self._lesser = model.fit, known
+        return known
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
@@ -328,8 +332,7 @@ class Selector:
     def _without(self, model: Model) -> Model:
         """The model less whatever it can do without."""
         while len(model.hypotheses) > 1:
-            fits = [self._less(model, h) for h in model.hypotheses]
-            fit_together(fits, self.replays, self.noise, iterations=8)
+            fits = self.without(model)
             costs = [fit.chi2 - model.fit.chi2 for fit in fits]
             spare = int(np.argmin(costs))
             if costs[spare] > self.enough:

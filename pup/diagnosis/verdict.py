@@ -163,9 +163,8 @@ def findings(
     nominal = selector.nominal
     left = left_over(final, selector.noise)
     told = []
-    for hypothesis in final.hypotheses:
-        alone = len(final.hypotheses) == 1
-        less = nominal.fit if alone else selector.without(final, hypothesis)
+    lesser = [nominal.fit] if len(final.hypotheses) == 1 else selector.without(final)
+    for hypothesis, less in zip(final.hypotheses, lesser, strict=True):
         assert less.residual is not None and final.fit.residual is not None
         squares = less.residual**2 - final.fit.residual**2
         gain = less.chi2 - final.fit.chi2
