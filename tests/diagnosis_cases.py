@@ -16,9 +16,19 @@ LSB = 2 * np.pi / 4096
 
 
 def recordings(
-    missing: Mapping[str, float], seed: int = 3, noise: float = 0.002
+    missing: Mapping[str, float],
+    seed: int = 3,
+    noise: float = 0.002,
+    late: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Recording, ...]:
-    """Six motions of four types, 4 s each, one of them done again, simulated in finer steps."""
+    """Five motions of four types, 4 s each, one of them done again, simulated in finer steps.
+
+    Args:
+      missing: what the nominal model leaves out.
+      seed: of the motions, the true parameters and the noise.
+      noise: of readings, rad.
+      late: how late commands arrive: mean and standard deviation, s.
+    """
     rng = np.random.default_rng(seed)
     levels = rng.uniform(-0.6, 0.6, 8)
 
@@ -55,9 +65,23 @@ def recordings(
     space = robot_space(BENCH, "pd")
     truth = dict(zip(space.names, space.nominal * np.exp(0.15 * rng.normal(size=4)), strict=True))
     whole = union(space, [truth | missing]).at(truth | missing)
-    fine = MujocoSimulator(replace(BENCH, timestep=BENCH.timestep / 4), plans, "pd")
+    arrived = [_arrived(plan, late, rng) if any(late) else plan for plan in plans]
+    fine = MujocoSimulator(replace(BENCH, timestep=BENCH.timestep / 4), arrived, "pd")
     told = fine.replay(whole.candidates()).position[0]
     read = np.round((told + noise * rng.normal(size=told.shape)) / LSB) * LSB
     return tuple(
-        replace(plan, position=read[part]) for plan, part in zip(plans, fine.ticks, strict=True)
+        replace(plan, position=read[part][np.isin(came.time, plan.time)])
+        for plan, came, part in zip(plans, arrived, fine.ticks, strict=True)
     )
+
+
+def _arrived(plan: Recording, late: tuple[float, float], rng: np.random.Generator) -> Recording:
+    """A recording as its servo sees it, with a tick more where each command arrives."""
+    mean, spread = late
+    come = plan.time + np.maximum(mean + spread * rng.normal(size=len(plan.time)), 0.0005)
+    come[0] = plan.time[0]
+    time = np.unique(np.concatenate([plan.time, come]))
+    order = np.argsort(come, kind="stable")
+    newest = np.maximum.accumulate(order)  # one that is overtaken is never obeyed
+    target = plan.target[newest[np.searchsorted(come[order], time, side="right") - 1]]
+    return replace(plan, time=time, target=target, position=target)
