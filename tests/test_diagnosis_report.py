@@ -258,6 +258,14 @@ def test_assumed_noise_is_admitted(bench: Maker, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_motions_that_come_late_are_admitted(bench: Maker, tmp_path: Path) -> None:
+    diagnosis = bench.nothing()
+    noise = replace(diagnosis.noise, late=0.012)
+    diagnosis = replace(diagnosis, nominal=replace(diagnosis.nominal, noise=noise))
+    assert "a motion comes earlier or later by ±12 ms" in page(diagnosis, tmp_path).text
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_an_error_that_nothing_explains_is_admitted(bench: Maker, tmp_path: Path) -> None:
     shown = page(bench.nothing(2.9), tmp_path)
     assert "No known effect is missing, but the simulator is off by 2.9 times" in shown.text

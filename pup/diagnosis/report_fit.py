@@ -58,7 +58,11 @@ def _noise(diagnosis: Diagnosis, speech: Speech) -> str:
     if tilts:
         text += f"; of the torso's angles {thousandths(float(noise.sigma[tilts].max()))} mrad"
     rho = float(noise.rho[read].mean()) if read else 0.0
-    return f"{text}. From tick to tick it is correlated by {rho:.2f}."
+    text += f". From tick to tick it is correlated by {rho:.2f}."
+    if noise.late:
+        late = speech.quantity(noise.late, "s")
+        text += f" Done again, a motion comes earlier or later by ±{late}, which weighs as noise."
+    return text
 
 
 def _parameters(diagnosis: Diagnosis, speech: Speech) -> Html:

@@ -339,7 +339,7 @@ def worst(diagnosis: Diagnosis, most: int) -> list[View]:
 def _squares(diagnosis: Diagnosis, model: Model) -> Array:
     """Squared errors on motions left out, in units of the noise's variance."""
     measured = diagnosis.measured
-    errors = (measured.values - model.predicted) / diagnosis.noise.sigma[measured.channel]
+    errors = (measured.values - model.predicted) / measured.deviation(diagnosis.noise)
     return np.asarray(errors**2)
 
 
