@@ -1,0 +1,92 @@
+"""How many simulations a diagnosis saves: refits of every effect at every place, beside it.
+
+`python -m benchmarks.exhaustive --robot darwin_leg RECORDINGS --diagnosis out/diagnosis.json`
+refits the nominal model with some effects of the library, drawn at random, each as the rival
+`exhaustive_bic` does it, and tells from these what all of them would take. One effect at a time is
+looked for, where the diagnosis looks for all: what is told is the least that such refits take.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.rivals.case import Case
+from benchmarks.rivals.refits import refitted
+from pup.diagnosis.hypotheses import hypotheses
+from pup.recording import load_recordings
+from pup.robot import RobotDescription
+
+SURE = 1.645
+"""Standard errors of a 90 % interval."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What exhaustive refits take.
+
+    Attributes:
+      effects: to be refitted: at every place, in every shape.
+      nominal: candidates simulated until the nominal fit is done.
+      each: candidates of each refit of a sample, shape (n_sample,).
+    """
+
+    effects: int
+    nominal: int
+    each: np.ndarray
+
+    @property
+    def whole(self) -> tuple[float, float]:
+        """Candidates of all refits and half the width of a 90 % interval."""
+        few = 1 - len(self.each) / self.effects  # of a sample drawn without putting back
+        error = np.sqrt(few * self.each.var(ddof=1) / len(self.each))
+        return (
+            self.nominal + self.effects * float(self.each.mean()),
+            SURE * self.effects * float(error),
+        )
+
+
+def cost(case: Case, sample: int, seed: int) -> Cost:
+    """Refit some effects, one after the other.
+
+    Args:
+      case: with its nominal fit.
+      sample: how many.
+      seed: of the draw.
+    """
+    every, nominal = hypotheses(case.measured), case.replays.count
+    drawn = np.random.default_rng(seed).choice(len(every), min(sample, len(every)), replace=False)
+    each = []
+    for done, number in enumerate(sorted(drawn), 1):
+        before = case.replays.simulated
+        refitted(case, case.nominal.fit, [every[number]])
+        taken = (case.replays.simulated - before) / len(case.measured.recordings)
+        each.append(taken)
+        print(f"{done}/{len(drawn)} {every[number].effect} at {every[number].place}: {taken:.0f}")
+    return Cost(len(every), nominal, np.array(each))
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", type=Path, nargs="+")
+    parser.add_argument("--robot", required=True)
+    parser.add_argument("--diagnosis", type=Path, required=True, help="its diagnosis.json")
+    parser.add_argument("--sample", type=int, default=32, help="effects that are refitted")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    robot = RobotDescription.load(asked.robot)
+    own = json.loads(asked.diagnosis.read_text())["simulations"]
+    told = cost(Case.of(robot, load_recordings(asked.recordings, robot)), asked.sample, asked.seed)
+    whole, reach = told.whole
+    print(
+        f"{told.effects} effects, {told.each.mean():.0f} candidates each: {whole:,.0f} "
+        f"(± {reach:,.0f}) with the nominal fit's {told.nominal}; the diagnosis took {own:,}, "
+        f"{whole / own:.1f} times fewer (90 %: {(whole - reach) / own:.1f} or more)"
+    )
+
+
+if __name__ == "__main__":
+    main()

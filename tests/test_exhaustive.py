@@ -1,0 +1,23 @@
+"""What refits of all effects would take, told from some of them."""
+
+import numpy as np
+import pytest
+
+from benchmarks.exhaustive import Cost, cost
+from benchmarks.rivals.case import Case
+from pup.diagnosis.hypotheses import hypotheses
+from tests.diagnosis_cases import BENCH, recordings
+
+
+def test_the_cost_of_all_is_told_from_some() -> None:
+    case = Case.of(BENCH, recordings({"coulomb_friction/torque@joint:servo": 0.03})[:3])
+    told = cost(case, 3, seed=1)
+    assert told.effects == len(hypotheses(case.measured))
+    assert (told.each > len(case.nominal.fit.at)).all()  # a Jacobian at least
+    whole, reach = told.whole
+    assert whole == pytest.approx(told.nominal + told.effects * told.each.mean())
+    assert reach > 0
+
+
+def test_what_was_all_refitted_is_certain() -> None:
+    assert Cost(3, 10, np.array([5.0, 7.0, 9.0])).whole == (31.0, 0.0)
