@@ -7,6 +7,7 @@ of these. Without any, this is the torque law alone.
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from pup.physics import kernels
 from pup.physics.commands import HeldCommands, Target
@@ -42,7 +43,6 @@ class Servos:
         self.limited = LimitedLaw(self.law, self.scene.inertia, self.viscous, self.scene.timestep)
         self.commands = commands
         self.power = None if power is None or (power == 1).all() else power
-        self.partly = np.zeros(0) if power is None else (power != 1).any(axis=1)
         self.delay = None if delay is None else delay[:, None]
         self.candidates = candidates
 
@@ -51,6 +51,7 @@ class Servos:
 
         self.late, self.commanding, self.sensing = of("lateness"), of("command"), of("sense")
         self.clocks = of("pace")
+        self.partly = np.zeros(0) if power is None else self._partly(power)
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self.before: Array | None = None
@@ -114,13 +115,20 @@ class Servos:
                 term.flow(flow)
         return torque - brake, damping + viscous
 
+    def _partly(self, power: Array) -> NDArray[np.bool_]:
+        """At which sub-steps the torque may be off somewhere, by whatever clock."""
+        partly = (power != 1).any(axis=1)
+        drift = sum(float(np.abs(term.pace() - 1).max()) for term in self.clocks)
+        off = np.ceil(drift * len(partly)) + 1 if drift else 0
+        return np.asarray(maximum_filter1d(partly, 2 * int(off) + 1, mode="nearest"))
+
     def _on(self, step: int | Array, running: int, time: float | Array) -> Array | None:
         """Share of a sub-step with the torque on, which is switched by the commands' clock.
 
         None where it is on in all simulations.
         """
         power = self.power
-        if power is None or not (self.clocks or self.partly[step]):
+        if power is None or not self.partly[step]:
             return None
         if not self.clocks:
             return np.repeat(power[step, :running], self.candidates)[:, None]
