@@ -132,34 +132,6 @@ class TestNoise:
         assert noise.sigma[0] == pytest.approx(0.003, rel=0.1)
         assert noise.rho[0] < 0.2
 
-    def test_motions_that_come_late_by_another_time_have_noise_where_they_are_fast(self) -> None:
-        measured = Measured.of(BENCH, recordings({}, noise=0.003))
-        rng = np.random.default_rng(0)
-        reading = 0.003 * rng.normal(size=len(measured.values))
-        moments = (measured.time / 0.3).astype(int)  # each motion has its own lateness
-        late = 0.02 * rng.normal(size=(len(measured.recordings), moments.max() + 1))
-        errors = reading + late[measured.recording, moments] * measured.speed
-        noise = noise_floor(measured, errors)
-        assert noise.sigma[0] == pytest.approx(0.003, rel=0.2)
-        assert noise.late == pytest.approx(0.02, rel=0.35)  # by the few repeated motions there are
-        white = measured.whiten(errors, replace(noise, rho=0 * noise.rho))
-        assert np.mean(white**2) == pytest.approx(1, abs=0.4)
-        assert noise_floor(measured, reading).late == 0
-
-    def test_commands_that_jitter_are_late_motions(self) -> None:
-        """What is left when the delay's mean is known, by the simulation without jitter."""
-        jittered = recordings({}, late=(0.015, 0.006))
-        on_time = recordings({}, late=(0.015, 0.0), noise=0.0)
-        measured = Measured.of(BENCH, jittered)
-        noise = noise_floor(measured, measured.values - Measured.of(BENCH, on_time).values)
-        assert noise.sigma[0] < 0.0035  # of 117 differences; their mean square is 0.011
-        assert noise.late == pytest.approx(0.006, rel=0.4)
-
-    def test_speed_is_that_of_the_motion_about_a_sample(self) -> None:
-        measured = Measured.of(BENCH, recordings({}))
-        ramp = replace(measured, values=0.7 * measured.time)
-        np.testing.assert_allclose(ramp.speed, 0.7, rtol=1e-6)
-
     def test_without_repeats_it_is_assumed_from_what_flickers(self) -> None:
         runs = [replace(r, repeat_of=None) for r in recordings({}) if r.id != "step_1"]
         measured = Measured.of(BENCH, runs)

@@ -1,14 +1,14 @@
 """The noise floor: what differs between repeats of a motion, else what flickers at rest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
+from pup.diagnosis.lateness import Difference, lateness, trimmed
 from pup.diagnosis.residuals import Measured, Noise
 from pup.physics.terms.scale import Scale
 from pup.recording import Recording
@@ -23,23 +23,14 @@ LEAST = 1e-4
 """No channel is believed to be less noisy than this, rad; slides as above."""
 MEMORY = 0.85
 """Errors at rest with a longer memory from tick to tick are a drift, not noise."""
-NORMAL_CUT = 0.965
-"""Mean square of a normal variable whose squares are cut at their 98 % quantile."""
 BLOCK = 0.5
 """Errors are looked at in blocks of this length to tell noise from what a model lacks, s."""
 FEWEST_BLOCKS = 8
 """Blocks of a channel below which they tell nothing of its noise."""
 QUIET = 2.5
 """Blocks with more than so many times the usual mean square are not noise alone."""
-EVIDENCE = 30.0
-"""Logarithm of odds from which repeats are believed to come at other times; errors that follow each
-other count as independent in it."""
-ROUNDS = 20
-"""Of weighted least squares, of which a few settle it."""
-SLOW = 0.25
-"""Share of the differences, the slowest, that tell the noise at rest."""
-NORMAL_MIDDLE = 0.455
-"""Median of a normal variable's squares."""
+GAP = 1.7
+"""Readings further apart than so many of the usual times have lost some between them."""
 DIGITS = 6
 """Decimals of a radian that readings are told apart by."""
 ON_GRID, MOSTLY = 0.1, 0.9
@@ -67,10 +58,12 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
     pairs = repeats(measured)
     differences = [d for a, b in pairs for d in _differences(measured, errors, a, b)]
     told: dict[int, tuple[float, float]] = {}
-    readings, late = [], 0.0
+    readings, late = [], None
     if differences:
+        # On the ground, impacts make motions differ everywhere, and no rest tells the noise alone.
         ground = any(measured.recordings[a].support == "ground" for a, _ in pairs)
-        told, late = _spreads(differences, uneven=not ground)
+        late = None if ground else lateness(differences, _least(measured))
+        told = {c: (s, late.rho) for c, s in late.sigma.items()} if late else _spreads(differences)
         counts = np.bincount([d.channel for d in differences], [len(d.errors) for d in differences])
         readings = [int(n) for n in counts if n]
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
@@ -80,7 +73,7 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
             if flicker:
                 told[channel] = flicker
     noise = _pooled(measured, told, source, int(np.median(readings)) if readings else 0)
-    return replace(noise, late=late)
+    return replace(noise, late=late.spread, rho_late=late.memory) if late else noise
 
 
 def quiet_noise(measured: Measured, errors: Array) -> Noise:
@@ -124,7 +117,7 @@ def _pooled(
     """Channels that say nothing take the median of their kind; one kind shares its correlation."""
     joints = len(measured.robot.joints)
     noise = assumed_noise(measured)
-    least = np.maximum(LEAST * Scale.of(measured.robot).angle, quanta(measured) / np.sqrt(12))
+    least = _least(measured)
     sigma, rho = noise.sigma.copy(), noise.rho.copy()
     for kind in (range(joints), range(joints, joints + 2)):
         known = [told[c] for c in kind if c in told]
@@ -140,72 +133,18 @@ def _pooled(
     return Noise(sigma, rho, source, readings)
 
 
-def _spreads(
-    differences: Sequence["Difference"], uneven: bool
-) -> tuple[dict[int, tuple[float, float]], float]:
-    """Standard deviation and memory of each channel, and how late motions come, s.
-
-    Commands that come late by another time each time move a joint otherwise wherever it moves, by
-    many times the noise of its readings, and not at all at rest. On the ground, impacts make
-    motions differ everywhere, and no rest tells the noise alone.
-    """
-    channels = sorted({d.channel for d in differences})
-    by_channel = [[d for d in differences if d.channel == channel] for channel in channels]
-    if uneven:
-        column = np.concatenate(
-            [np.full(len(d.errors), channels.index(d.channel)) for d in differences]
-        )
-        variances, late = _lateness(
-            np.concatenate([d.errors for d in differences]) ** 2,
-            np.concatenate([d.speed for d in differences]) ** 2,
-            column,
-        )
-        if late:
-            scales = [
-                [np.sqrt(variance + (late * d.speed) ** 2) for d in own]
-                for variance, own in zip(variances, by_channel, strict=True)
-            ]
-            told = {}
-            for channel, variance, own, scale in zip(
-                channels, variances, by_channel, scales, strict=True
-            ):
-                _, rho = _spread([d.errors / s for d, s in zip(own, scale, strict=True)])
-                told[channel] = float(np.sqrt(variance)), rho
-            return told, late
-    return {
-        channel: _spread([d.errors for d in own])
-        for channel, own in zip(channels, by_channel, strict=True)
-    }, 0.0
+def _spreads(differences: Sequence[Difference]) -> dict[int, tuple[float, float]]:
+    """Standard deviation and memory of each channel."""
+    by_channel: dict[int, list[Array]] = {}
+    for difference in differences:
+        by_channel.setdefault(difference.channel, []).append(difference.errors)
+    return {channel: _spread(parts) for channel, parts in by_channel.items()}
 
 
-def _lateness(squares: Array, speeds: Array, column: NDArray[np.int64]) -> tuple[Array, float]:
-    """Variance of each channel at rest, and the time by which motions are late; 0 for none.
-
-    By iterated weighted least squares, which end where the likelihood of normal errors is largest.
-
-    Args:
-      squares: of differences, (n,), rad².
-      speeds: squared, (n,), (rad/s)².
-      column: which channel each is of, (n,).
-    """
-    alike = np.bincount(column, squares) / np.bincount(column)
-    design = np.column_stack([column == k for k in range(len(alike))] + [speeds]).astype(float)
-    slow = [
-        np.flatnonzero((column == k) & (speeds <= np.quantile(speeds[column == k], SLOW)))
-        for k in range(len(alike))
-    ]
-    variance, found = alike[column], np.r_[alike, 0.0]
-    for _ in range(ROUNDS):
-        # Where it is slow, a channel is as noisy as it shows there, but for the large among them.
-        middle = [np.median(squares[own] / variance[own]) / NORMAL_MIDDLE for own in slow]
-        least = found[:-1] * middle
-        found, _ = nnls(design / variance[:, None], squares / variance)
-        found[:-1] = np.maximum(found[:-1], least)
-        variance = design @ found
-    even = alike[column]
-    gain = float(np.sum(np.log(even / variance) + squares / even - squares / variance)) / 2
-    late = float(np.sqrt(found[-1]))
-    return (found[:-1], late) if gain > EVIDENCE else (alike, 0.0)
+def _least(measured: Measured) -> Array:
+    """Standard deviation that each channel's readings have at least, rad."""
+    angle = Scale.of(measured.robot).angle
+    return np.asarray(np.maximum(LEAST * angle, quanta(measured) / np.sqrt(12)))
 
 
 def quanta(measured: Measured) -> Array:
@@ -237,12 +176,7 @@ def _spread(parts: Sequence[Array]) -> tuple[float, float]:
 
 def _moments(parts: Sequence[Array]) -> tuple[float, float]:
     """Variance and lag-one covariance of some runs."""
-    squares = np.concatenate([p**2 for p in parts])
-    # A foot that slips once or a lost packet is no noise: the mean of all but the largest.
-    cut = float(np.quantile(squares, 0.98)) if len(squares) > 50 else np.inf
-    variance = float(np.mean(np.minimum(squares, cut)))
-    if np.isfinite(cut):
-        variance /= NORMAL_CUT
+    variance = trimmed(np.concatenate(parts) ** 2)
     return variance, float(np.mean(np.concatenate([p[1:] * p[:-1] for p in parts])))
 
 
@@ -259,21 +193,6 @@ def repeats(measured: Measured) -> list[tuple[int, int]]:
     return pairs
 
 
-@dataclass(frozen=True, eq=False)
-class Difference:
-    """Half the difference of two repeats' errors in one channel, of one recording's variance.
-
-    Attributes:
-      channel: which.
-      errors: shape (n,), rad.
-      speed: of the motion about them, shape (n,), rad/s.
-    """
-
-    channel: int
-    errors: Array
-    speed: Array
-
-
 def _differences(measured: Measured, errors: Array, a: int, b: int) -> list[Difference]:
     """What differs between two repeats, by channel."""
     out = []
@@ -283,16 +202,20 @@ def _differences(measured: Measured, errors: Array, a: int, b: int) -> list[Diff
         if first.sum() < 5 or second.sum() < 5:
             continue
         time, other = measured.time[first], measured.time[second]
-        inside = (time >= other[0]) & (time <= other[-1])
-        if inside.sum() < 5:
+        at = np.clip(np.searchsorted(other, time) - 1, 0, len(other) - 2)
+        # Between readings that are far apart, what was lost there is no difference.
+        apart = np.diff(other)
+        near = (time >= other[0]) & (time <= other[-1]) & (apart[at] < GAP * np.median(apart))
+        if near.sum() < 5:
             continue
-        at = np.clip(np.searchsorted(other, time[inside]) - 1, 0, len(other) - 2)
-        share = (time[inside] - other[at]) / (other[at + 1] - other[at])
+        time, at = time[near], at[near]
+        share = (time - other[at]) / apart[at]
         told = errors[second]
         matched = (1 - share) * told[at] + share * told[at + 1]
         variance = 1 + (1 - share) ** 2 + share**2  # of the difference, in one reading's
-        difference = (errors[first][inside] - matched) / np.sqrt(variance)
-        speed = np.sqrt((measured.speed[first][inside] ** 2 + measured.speed[second][at] ** 2) / 2)
+        difference = (errors[first][near] - matched) / np.sqrt(variance)
+        speeds = measured.speed[first][near] ** 2 + measured.speed[second][at] ** 2
+        speed = np.sqrt(speeds / variance)  # neighbours are late together
         out.append(Difference(channel, difference, speed))
     return out
 

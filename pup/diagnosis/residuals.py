@@ -26,7 +26,9 @@ SETTLING = 0.1
 UNSURE = {"repeats": 0.05, "assumed": 0.15}
 """By what share a noise floor's variance may be wrong, however many readings tell it."""
 AROUND = 0.06
-"""Time before and after a sample whose speed is that of the motion about it, s."""
+"""Time before and after a sample whose speed counts as that of the motion about it, s."""
+NEARBY = 0.045
+"""The same for the readings that tell a speed: through several, noise hardly tilts a line."""
 LOST = 3.0
 """Error counted for a simulation that broke down, rad."""
 
@@ -42,6 +44,7 @@ class Noise:
       readings: differences of repeats that tell a channel's; 0 where none do.
       late: standard deviation of the time by which motions come early or late when they are done
         again, s: of errors that grow with the speed.
+      rho_late: correlation of these errors from tick to tick.
     """
 
     sigma: Array
@@ -49,6 +52,7 @@ class Noise:
     source: Literal["repeats", "assumed"]
     readings: int = 0
     late: float = 0.0
+    rho_late: float = 0.0
 
     @property
     def unsure(self) -> float:
@@ -124,14 +128,8 @@ class Measured:
         """How fast each channel moves about each sample, shape (n_samples,), rad/s."""
         told = np.zeros(len(self.values))
         for run in np.split(np.arange(len(self.values)), np.flatnonzero(~self._follows)[1:]):
-            if len(run) < 2:
-                continue
-            time = self.time[run]
-            squares = np.gradient(self.values[run], time) ** 2
-            sums = np.concatenate([[0.0], np.cumsum(squares)])
-            first = np.searchsorted(time, time - AROUND)
-            last = np.searchsorted(time, time + AROUND, side="right")
-            told[run] = np.sqrt((sums[last] - sums[first]) / (last - first))
+            if len(run):
+                told[run] = _speeds(self.time[run], self.values[run])
         return told
 
     def deviation(self, noise: Noise) -> Array:
@@ -146,8 +144,12 @@ class Measured:
 
     def whiten(self, errors: Array, noise: Noise) -> Array:
         """Errors (..., n_samples), rad, in units of uncorrelated noise."""
-        rho = np.where(self._follows, noise.rho[self.channel], 0.0)
-        scaled = errors / self.deviation(noise)
+        deviation = self.deviation(noise)
+        read = (noise.sigma[self.channel] / deviation) ** 2  # the share of readings in the variance
+        rho = np.where(
+            self._follows, noise.rho[self.channel] * read + noise.rho_late * (1 - read), 0.0
+        )
+        scaled = errors / deviation
         before = np.concatenate([scaled[..., :1], scaled[..., :-1]], axis=-1)
         return np.asarray((scaled - rho * before) / np.sqrt(1 - rho**2))
 
@@ -170,6 +172,29 @@ def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:
         absent = np.full(len(recording.time), np.nan)
         columns += [recording.extras.get(f"imu/{a}", absent) for a in ("roll", "pitch")]
     return columns
+
+
+def _speeds(time: Array, values: Array) -> Array:
+    """Root mean square, about each time, of the slopes of lines through the values nearby."""
+    squares = _slopes(time, values) ** 2
+    (total,), count = _sums(time, AROUND, squares)
+    return np.asarray(np.sqrt(np.maximum(total, 0.0) / count))
+
+
+def _slopes(time: Array, values: Array) -> Array:
+    """Slopes of lines through the values near each time; 0 where there is only one."""
+    x, y = time - time.mean(), values - values.mean()
+    (sx, sy, sxx, sxy), count = _sums(time, NEARBY, x, y, x * x, x * y)
+    alone = count < 2
+    return np.where(alone, 0.0, (count * sxy - sx * sy) / np.where(alone, 1, count * sxx - sx * sx))
+
+
+def _sums(time: Array, reach: float, *values: Array) -> tuple[list[Array], NDArray[np.int64]]:
+    """Sums of some values within reach of each time, and how many are summed."""
+    first = np.searchsorted(time, time - reach)
+    last = np.searchsorted(time, time + reach, side="right")
+    sums = [np.concatenate([[0.0], np.cumsum(v)]) for v in values]
+    return [s[last] - s[first] for s in sums], last - first
 
 
 def steady_start(recording: Recording) -> Recording:
