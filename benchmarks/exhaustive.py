@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.rivals.case import Case
-from benchmarks.rivals.refits import refitted
+from benchmarks.rivals.refits import TOGETHER, refitted
 from pup.diagnosis.hypotheses import hypotheses
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
@@ -30,7 +30,7 @@ class Cost:
     Attributes:
       effects: to be refitted: at every place, in every shape.
       nominal: candidates simulated until the nominal fit is done.
-      each: candidates of each refit of a sample, shape (n_sample,).
+      each: candidates of a refit, in the mean of some that are refitted in step, (n_steps,).
     """
 
     effects: int
@@ -40,31 +40,29 @@ class Cost:
     @property
     def whole(self) -> tuple[float, float]:
         """Candidates of all refits and half the width of a 90 % interval."""
-        few = 1 - len(self.each) / self.effects  # of a sample drawn without putting back
-        error = np.sqrt(few * self.each.var(ddof=1) / len(self.each))
-        return (
-            self.nominal + self.effects * float(self.each.mean()),
-            SURE * self.effects * float(error),
-        )
+        few = max(1 - TOGETHER * len(self.each) / self.effects, 0.0)  # drawn without putting back
+        error = float(np.sqrt(few * self.each.var(ddof=1) / len(self.each)))
+        return self.nominal + self.effects * float(self.each.mean()), SURE * self.effects * error
 
 
-def cost(case: Case, sample: int, seed: int) -> Cost:
-    """Refit some effects, one after the other.
+def cost(case: Case, steps: int, seed: int) -> Cost:
+    """Refit some effects, as many in step as the rival does.
 
     Args:
       case: with its nominal fit.
-      sample: how many.
+      steps: how many times.
       seed: of the draw.
     """
     every, nominal = hypotheses(case.measured), case.replays.count
-    drawn = np.random.default_rng(seed).choice(len(every), min(sample, len(every)), replace=False)
+    order = np.random.default_rng(seed).permutation(len(every))
+    steps = min(steps, len(every) // TOGETHER)
     each = []
-    for done, number in enumerate(sorted(drawn), 1):
+    for step, drawn in enumerate(order[: steps * TOGETHER].reshape(steps, -1), 1):
         before = case.replays.simulated
-        refitted(case, case.nominal.fit, [every[number]])
+        refitted(case, case.nominal.fit, [every[i] for i in sorted(drawn)])
         taken = (case.replays.simulated - before) / len(case.measured.recordings)
-        each.append(taken)
-        print(f"{done}/{len(drawn)} {every[number].effect} at {every[number].place}: {taken:.0f}")
+        each.append(taken / TOGETHER)
+        print(f"{step * TOGETHER} of {len(every)} refitted: {each[-1]:.0f} candidates each")
     return Cost(len(every), nominal, np.array(each))
 
 
@@ -74,12 +72,12 @@ def main() -> None:
     parser.add_argument("recordings", type=Path, nargs="+")
     parser.add_argument("--robot", required=True)
     parser.add_argument("--diagnosis", type=Path, required=True, help="its diagnosis.json")
-    parser.add_argument("--sample", type=int, default=32, help="effects that are refitted")
+    parser.add_argument("--steps", type=int, default=4, help=f"times that {TOGETHER} are refitted")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     robot = RobotDescription.load(asked.robot)
     own = json.loads(asked.diagnosis.read_text())["simulations"]
-    told = cost(Case.of(robot, load_recordings(asked.recordings, robot)), asked.sample, asked.seed)
+    told = cost(Case.of(robot, load_recordings(asked.recordings, robot)), asked.steps, asked.seed)
     whole, reach = told.whole
     print(
         f"{told.effects} effects, {told.each.mean():.0f} candidates each: {whole:,.0f} "

@@ -14,7 +14,7 @@ def rms(case: Case) -> Verdict:
     """Point at the joint with the largest error after the nominal fit, in units of its noise."""
     robot, measured = case.robot, case.measured
     errors = measured.values - case.replays([case.nominal.fit.row()])[0]
-    scaled = errors / case.noise.sigma[measured.channel]
+    scaled = errors / measured.deviation(case.noise)
     squares, limits = [], []
     for joint in range(len(robot.joints)):
         own = scaled[measured.channel == joint]

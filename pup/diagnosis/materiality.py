@@ -60,9 +60,11 @@ def little(model: Model, shown: HeldOut) -> str:
 
 def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
     """By how much the joints' errors on motions left out fall, in their noise."""
-    names = model.measured.robot.joint_names
+    names, measured = model.measured.robot.joint_names, model.measured
+    variance = measured.deviation(noise) ** 2
     for name, (before, after) in shown.per_joint.items():
-        yield (before - after) / float(noise.sigma[names.index(name)])
+        own = measured.channel == names.index(name)
+        yield (before - after) / float(np.sqrt(np.mean(variance[own])))
 
 
 def _explains(nominal: Model, model: Model) -> bool:

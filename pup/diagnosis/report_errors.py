@@ -135,7 +135,7 @@ def _panel(diagnosis: Diagnosis, speech: Speech, view: View) -> Html:
             measured=factor * measured.values[chosen],
             models={(n, COLOURS[n]): factor * m.predicted[chosen] for n, m in models.items()},
             command=command,
-            noise=1000 * float(diagnosis.noise.sigma[view.channel]),
+            noise=1000 * float(np.sqrt(np.mean(measured.deviation(diagnosis.noise)[chosen] ** 2))),
             span=(view.window.start, view.window.end),
             unit=unit,
             small=small,

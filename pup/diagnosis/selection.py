@@ -146,7 +146,7 @@ class Selector:
         self.enough, self.most = enough, most
         self.folds = folds(replays)
         self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
-        self._lesser: tuple[Fit | None, list[Fit]] = None, []
+        self._lesser: tuple[Model | None, list[Fit]] = None, []
         self.nominal = self.predicting(self.model((), nominal))
 
     def run(self, start: Model) -> tuple[Model, list[Round]]:
@@ -214,10 +214,11 @@ class Selector:
     def without(self, model: Model) -> list[Fit]:
         """The model refitted without each of its effects in turn."""
         of, known = self._lesser
-        if of is not model.fit:  # what was asked last is mostly asked again
+        asked_again = of is not None and of.fit is model.fit and of.hypotheses == model.hypotheses
+        if not asked_again:
             known = [self._less(model, h) for h in model.hypotheses]
             fit_together(known, self.replays, self.noise, iterations=ROUGH)
-            self._lesser = model.fit, known
+            self._lesser = model, known
         return known
 
     def _round(self, model: Model) -> Round | None:

@@ -35,6 +35,10 @@ SLIGHT = 0.25
 """Share of its typical size below which an effect is what every robot has a little of."""
 WORTH_SAYING = 0.03
 """Alternatives less probable than this are not told."""
+JITTERY = ("command_delay", "measurement_delay")
+"""Effects whose ticks may be late by another time each."""
+LASTING = 10
+"""Ticks for which the errors of one that was late go on."""
 TWIN = 0.995
 """Traces that overlap by so much cannot be told apart, refitted or not."""
 
@@ -307,12 +311,13 @@ def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
 
 def _uneven(hypothesis: Hypothesis, final: Model, noise: Noise) -> dict[str, Parameter]:
     """By how much a delay changes from tick to tick, where it does: what repeats tell, and more."""
-    if hypothesis.family != "delay":
+    if hypothesis.effect not in JITTERY:
         return {}
     more = jitter(final)
     if more is None and not noise.late:
         return {}
-    sure = 1 - 1.645 * noise.unsure / 2, 1 + 1.645 * noise.unsure / 2
+    reach = BAND / np.sqrt(2 * max(noise.readings / LASTING, 1))
+    sure = max(1 - reach, 0.0), 1 + reach
     ends = (more.lower, more.upper) if more else (0.0, 0.0)
     return {
         "jitter": Parameter(

@@ -43,7 +43,7 @@ def _compile(make: Callable[..., Any], function: Callable[..., Any], *types: obj
     """Compile, and keep the outcome for the next process where some folder can be written."""
     try:
         return make(*types, cache=True)(function)
-    except RuntimeError:  # of numba, where there is none, as in a container that is read-only
+    except (RuntimeError, OSError, EOFError):  # there is none, it is full, or was cut short
         return make(*types)(function)
 
 

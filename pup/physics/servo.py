@@ -51,7 +51,7 @@ class Servos:
 
         self.late, self.commanding, self.sensing = of("lateness"), of("command"), of("sense")
         self.clocks = of("pace")
-        self.partly = np.zeros(0) if power is None else self._partly(power)
+        self.partly = None if self.power is None else self._partly(self.power)
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
         self.before: Array | None = None
@@ -128,7 +128,7 @@ class Servos:
         None where it is on in all simulations.
         """
         power = self.power
-        if power is None or not self.partly[step]:
+        if power is None or self.partly is None or not self.partly[step]:
             return None
         if not self.clocks:
             return np.repeat(power[step, :running], self.candidates)[:, None]
