@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 from refusals import Place
 
 from pup.robot import RobotDescription
 from pup.sysid.virtual import record
+
+settings.register_profile("patient", deadline=None)  # a machine that is busy is no fault
+settings.load_profile("patient")
 
 SHARED = Path(__file__).parents[2] / "shared"
 

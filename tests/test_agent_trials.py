@@ -283,7 +283,7 @@ def test_one_trial_at_a_time_and_a_new_attempt_replaces_what_has_not_moved(tmp_p
 
 
 @given(st.integers(1, 400))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_journal_survives_being_cut_off_anywhere(cut: int) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder)

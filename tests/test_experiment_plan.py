@@ -77,7 +77,7 @@ PLANS = st.builds(
 )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(PLANS)
 def test_cells_stand_behind_what_they_need_and_are_no_more_than_wanted(plan: Plan) -> None:
     cells = graph(plan)

@@ -22,7 +22,7 @@ ROWS = st.integers(1, 3).flatmap(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(ROWS)
 def test_an_estimate_is_of_all_robots_and_its_interval_of_their_kind(rows):
     for statistic in (mean, median):
@@ -37,7 +37,7 @@ def test_an_estimate_is_of_all_robots_and_its_interval_of_their_kind(rows):
             assert told == estimate(statistic, rows)  # by its seed
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=2, max_size=8))
 def test_shares_and_ratios(rows):
     above = estimate(share_above, rows)

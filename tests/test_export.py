@@ -67,7 +67,7 @@ def test_mcap_comes_back_bit_by_bit(tmp_path: Path) -> None:
     assert read[0].joints == FULL.joints
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(*[st.none() | st.floats(allow_nan=False, allow_infinity=False)] * 5),

@@ -101,7 +101,7 @@ def test_flat_objective_does_not_restart_the_search() -> None:
     assert inner.countiter == 40
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.integers(1, SPHERE.generations), st.booleans())
 def test_resumes_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, at: int, again: bool):
     """Interrupted after any generation, once or twice, nothing of the result changes."""
@@ -172,7 +172,7 @@ def test_a_torn_checkpoint_is_refused(tmp_path: Path, name: str) -> None:
         run_fit(SPHERE, sphere, checkpoint)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.floats(0, 1, exclude_max=True), st.integers(0, 255))
 def test_any_cut_or_flipped_byte_is_refused_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, where: float, flip: int

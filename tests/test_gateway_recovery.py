@@ -248,7 +248,7 @@ def test_a_study_that_cannot_go_on_says_so_and_goes_on_when_it_can(tmp_path):
         assert "failed" not in conductor.waits_for(conductor.studies["s"])
         store.close()
 
-    asyncio.run(asyncio.wait_for(live(), 20))
+    asyncio.run(asyncio.wait_for(live(), 120))
 
 
 def test_a_page_does_not_wait_for_a_slow_process_and_many_pages_ask_for_one():
@@ -270,7 +270,7 @@ def test_a_page_does_not_wait_for_a_slow_process_and_many_pages_ask_for_one():
         assert len(asked) == 1 and told == ["s"]
         assert (await made.soon(study, None, 0.05))["walks"] == 9
 
-    asyncio.run(asyncio.wait_for(live(), 20))
+    asyncio.run(asyncio.wait_for(live(), 120))
 
 
 def test_a_silent_agent_loses_the_trial_and_its_late_result_never_counts(tmp_path, quiet):

@@ -265,7 +265,7 @@ def logs(tmp_path_factory: Any) -> dict[str, tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize("name", [*FORMATS, "mcap json", "emps compressed"])
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_damaged_logs_are_refused_or_read_and_nothing_else(
     tmp_path_factory: Any, logs: dict[str, tuple[str, bytes]], name: str, data: st.DataObject

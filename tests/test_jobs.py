@@ -112,7 +112,7 @@ OUTCOMES = st.none() | st.builds(Outcome, st.just(1), st.sampled_from([0, 1, 2, 
 LOOKS = st.lists(st.tuples(SEEN, OUTCOMES, st.booleans(), st.booleans()), max_size=30)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(LOOKS)
 def test_whatever_is_seen_a_job_keeps_to_its_rules(looks):
     """States that are final stay; attempts end once and in order; failures stay within retries."""

@@ -95,7 +95,7 @@ def test_methods_see_what_they_should() -> None:
 # --- Symmetry -------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_mirror_is_an_involution(seed: int) -> None:
     """Mirrored twice, everything is as it was."""

@@ -111,7 +111,7 @@ def recordings(draw: st.DrawFn) -> Recording:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(recordings())
 def test_writing_and_reading_keeps_everything(tmp_path_factory: Any, recording: Recording) -> None:
     path = tmp_path_factory.mktemp("round") / "r.parquet"

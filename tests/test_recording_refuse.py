@@ -160,7 +160,7 @@ def whole(tmp_path_factory: Any) -> bytes:
     return path.read_bytes()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(cut=st.integers(0, 10_000))
 def test_refuses_every_truncated_file(tmp_path_factory: Any, whole: bytes, cut: int) -> None:
     path = tmp_path_factory.mktemp("cut") / "r.parquet"
@@ -169,7 +169,7 @@ def test_refuses_every_truncated_file(tmp_path_factory: Any, whole: bytes, cut: 
         Recording.read(path)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(place=st.integers(0, 10_000), bits=st.integers(1, 255))
 def test_a_flipped_byte_is_refused_or_harmless(
     tmp_path_factory: Any, whole: bytes, place: int, bits: int

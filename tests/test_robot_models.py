@@ -76,7 +76,7 @@ def test_mass_and_height_are_the_official_ones() -> None:
     assert data.geom("l_foot").xpos[2] == pytest.approx(MODEL.geom("l_foot").size[2], abs=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(arrays(np.float64, 20, elements=st.floats(-2, 2)))
 def test_a_mirrored_pose_has_mirrored_bodies(q: NDArray[np.float64]) -> None:
     """Positions of frames, of centres of mass and of shells, and the joint-space inertia."""

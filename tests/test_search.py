@@ -37,7 +37,7 @@ def moves(rests: list[float], period: float = 0.02) -> Recording:
 
 
 class TestPieces:
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(st.lists(st.floats(0.1, 3.0), min_size=6, max_size=30))
     def test_nothing_is_lost_and_parts_start_at_rest(self, rests: list[float]) -> None:
         whole = moves(rests)

@@ -165,7 +165,7 @@ def test_no_effect_is_an_artefact_of_the_sub_step() -> None:
 SHORT = steps(LEG, LEG_POSE, 0.35, "suspended")
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(st.sampled_from(IN_THE_AIR), min_size=2, max_size=3, unique=True), st.data())
 def test_effects_compose(effects: list[str], data: st.DataObject) -> None:
     """Two or three at the same place, as large as a lab meets them: nothing breaks down."""

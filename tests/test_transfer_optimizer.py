@@ -70,7 +70,7 @@ def test_the_first_trials_are_the_middle_and_uniform_and_do_not_depend_on_what_w
     assert np.abs(drawn.std(axis=0) - 1 / np.sqrt(3)).max() < 0.02
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(
     st.lists(st.floats(0, 1), min_size=5, max_size=12),
     st.integers(0, 2**31 - 1),

@@ -37,7 +37,7 @@ def robot() -> VirtualRobot:
 
 
 @given(noise=st.binary(max_size=200), cuts=st.lists(st.integers(1, 50), max_size=5))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_random_bytes_never_stop_the_bus(
     robot: VirtualRobot, noise: bytes, cuts: list[int]
 ) -> None:
@@ -69,7 +69,7 @@ def test_random_bytes_never_stop_the_bus(
     st.binary(max_size=60),
     st.sampled_from([1, 2]),
 )
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_sound_packets_with_any_content_are_survived(
     id: int, instruction: int, parameters: bytes, protocol: int
 ) -> None:
@@ -92,7 +92,7 @@ _POOL: dict[int, VirtualRobot] = {}
 
 
 @given(st.binary(max_size=100))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_random_bytes_never_stop_the_imu(robot: VirtualRobot, noise: bytes) -> None:
     imu = Bno055(robot.plant)
     imu.feed(noise)
