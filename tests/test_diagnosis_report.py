@@ -319,6 +319,21 @@ def test_one_effect_at_two_places_is_one_item(backlash: Diagnosis, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_what_is_less_likely_than_not_is_told_as_such(backlash: Diagnosis, tmp_path: Path) -> None:
+    first = backlash.findings[0]
+    drag = replace(first, effect="quadratic_damping", probability=0.3, equivalents=())
+    shown = page(replace(backlash, findings=(first, drag)), tmp_path)
+    assert "The simulator lacks backlash at the left knee, perhaps 1 more." in shown.text
+    assert "2Perhaps: " in shown.text
+    assert "1Perhaps: " not in shown.text
+    unsure = (replace(first, probability=0.4, equivalents=()), drag)
+    assert (
+        "Most likely, the simulator lacks 2 effects."
+        in page(replace(backlash, findings=unsure), tmp_path).text
+    )
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_several_effects_are_listed_with_their_numbers(backlash: Diagnosis, tmp_path: Path) -> None:
     first = backlash.findings[0]
     drags = [

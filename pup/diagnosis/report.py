@@ -108,7 +108,10 @@ class _Report:
         yield tag("p", f"Diagnosis of {diagnosis.robot.name}, from {count}", class_="lead")
         yield tag("h1", self.title())
         if len(self.items) > 1:
-            lines = ([*map(badge, item.numbers), item.text] for item in self.items)
+            lines = (
+                [*map(badge, item.numbers), "Perhaps: " if item.doubtful else "", item.text]
+                for item in self.items
+            )
             yield tag("ul", *(tag("li", join(line)) for line in lines), style=LIST)
         for words in {"mismatch": self.hid, "none": self.nothing, "undetermined": self.unclear}[
             diagnosis.verdict
@@ -133,9 +136,12 @@ class _Report:
         if len(self.items) == 1:
             return ("Most likely: " if unsure else "") + self.single()
         known = [item for item in self.items if item.effect != NAMELESS]
-        lacks = known[0].name if len(known) == 1 else f"{len(known)} effects"
-        beyond = f", and {WORDS[NAMELESS]}" if len(known) < len(self.items) else ""
-        return f"The simulator lacks {lacks}{beyond}."
+        sure = [item for item in known if not item.doubtful] or known
+        lacks = sure[0].name if len(sure) == 1 else f"{len(sure)} effects"
+        beyond = f", perhaps {len(known) - len(sure)} more" if len(sure) < len(known) else ""
+        beyond += f", and {WORDS[NAMELESS]}" if len(known) < len(self.items) else ""
+        likely = "Most likely, the" if sure[0].doubtful else "The"
+        return f"{likely} simulator lacks {lacks}{beyond}."
 
     def single(self) -> str:
         """The one effect that is missing, at one place or at several."""

@@ -76,12 +76,14 @@ class Item:
       numbers: of the findings among all, from 1.
       name: effect and places, as they stand behind "the simulator lacks".
       text: a sentence.
+      doubtful: whether it is less likely there than not, with what it cannot be told from.
     """
 
     effect: str
     numbers: tuple[int, ...]
     name: str
     text: str
+    doubtful: bool
 
 
 def items(diagnosis: Diagnosis, speech: Speech) -> list[Item]:
@@ -102,7 +104,8 @@ def _item(
     text = f"{capital(text)}."
     if len(told) == 1:
         text = sentence(diagnosis, told[0][1], speech)
-    return Item(effect, tuple(number for number, _ in told), name, text)
+    doubtful = not any(finding.believed for _, finding in told)
+    return Item(effect, tuple(number for number, _ in told), name, text, doubtful)
 
 
 def sentence(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:

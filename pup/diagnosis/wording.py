@@ -208,6 +208,8 @@ class Speech:
             return minus(self.angle(value, count) + unit.removeprefix("rad"))
         everyday = {"s": (1000, "ms"), "m": (1000, "mm"), "kg": (1000, "g"), "1/s": (100, "%/s")}
         factor, name = everyday.get(unit, (1, self.unit(unit)))
+        if unit == "s" and abs(value) >= 1:
+            factor, name = 1, "s"
         return minus(f"{digits(factor * value, count)} {name}".removesuffix(" 1"))
 
     def shifts(self, absorbed: Mapping[str, float], most: int = 2) -> str:
