@@ -171,12 +171,7 @@ def _blind_make(action: argparse.ArgumentParser) -> None:
 def _blind_run(action: argparse.ArgumentParser) -> None:
     _paths(action, ("--set", "DIR", "folder of the set"))
     out(action, "run.json and, for each case, what `pup diagnose` writes but the report")
-    action.add_argument(
-        "--limit",
-        type=number(1, 1_000_000),
-        metavar="N",
-        help="only the first N cases by their random ids; default: all",
-    )
+    _limit(action)
     place(action)
 
 
@@ -187,6 +182,16 @@ def _blind_score(action: argparse.ArgumentParser) -> None:
         ("--key", "FILE", "its key, revealed"),
         ("--diagnoses", "DIR", "what `pup blind run` wrote: a case_<id>/diagnosis.json each"),
         ("--out", "FILE", "where the scores go, as JSON; a table goes beside it"),
+    )
+    _limit(action)
+
+
+def _limit(action: argparse.ArgumentParser) -> None:
+    action.add_argument(
+        "--limit",
+        type=number(1, 1_000_000),
+        metavar="N",
+        help="only the first N cases by their random ids; default: all",
     )
 
 

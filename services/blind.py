@@ -64,7 +64,9 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
         raise InputError(f"{options.diagnoses / JOURNAL}: tells of a run over another set")
     with counted("blind score") as tell:
         oracle = Oracle(options.set, options.diagnoses, tell)
-        scores = score_set(options.set, options.key, options.diagnoses, oracle)
+        first = sorted(case.name.removeprefix("case_") for case in options.set.glob("case_*"))
+        only = None if options.limit is None else first[: options.limit]
+        scores = score_set(options.set, options.key, options.diagnoses, oracle, only)
     scores["engine"] = journal["engine"] if journal else None
     write_json(options.out, scores)
     page = markdown(scores)

@@ -128,6 +128,16 @@ def test_scores_have_the_oracle_ratio_and_both_commits(diagnosed: Path, tmp_path
     assert str(scores["engine"]["git_sha"] or "without a commit") in table
 
 
+def test_the_first_cases_can_be_scored_alone(diagnosed: Path, tmp_path: Path) -> None:
+    """As where a run was stopped after `--limit`: the others are not missing."""
+    options = ("--set", diagnosed / "set", "--key", diagnosed / "key.json", "--limit", 1)
+    where = ("--diagnoses", diagnosed / "out", "--out", tmp_path / "scores.json")
+    done = pup("blind", "score", *options, *where, "--json")
+    assert done.code == 0, done.err
+    assert "# Blind score: 1 cases" in (tmp_path / "scores.md").read_text()
+    assert done.json()["all"]["class_top1"]["hits"] == 1
+
+
 def test_a_finished_run_is_left_as_it_is(diagnosed: Path) -> None:
     before = files(diagnosed / "out")
     done = run(diagnosed)
