@@ -55,6 +55,7 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
     from pup.blind.score import score_set
     from pup.blind.table import markdown
     from services.blind_oracle import Oracle
+    from services.blind_run import cases_of
 
     table = options.out.with_suffix(".md")
     if options.out.is_dir() or options.out == table:
@@ -64,8 +65,8 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
         raise InputError(f"{options.diagnoses / JOURNAL}: tells of a run over another set")
     with counted("blind score") as tell:
         oracle = Oracle(options.set, options.diagnoses, tell)
-        first = sorted(case.name.removeprefix("case_") for case in options.set.glob("case_*"))
-        only = None if options.limit is None else first[: options.limit]
+        first = [c.name.removeprefix("case_") for c in cases_of(options.set, options.limit)]
+        only = None if options.limit is None else first
         scores = score_set(options.set, options.key, options.diagnoses, oracle, only)
     scores["engine"] = journal["engine"] if journal else None
     write_json(options.out, scores)

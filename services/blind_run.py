@@ -74,12 +74,17 @@ def orders(folder: Path, out: Path, limit: int | None) -> tuple[list[Order], dic
     commitment = read_set(folder)
     if out.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{out}: lies in the set's own folder; use another")
-    # Absolute, as a worker's working directory is another.
-    cases = sorted(case.absolute() for case in folder.glob("case_*") if case.is_dir())
+    cases = cases_of(folder, limit)
     if not cases:
         raise InputError(f"{folder}: its {COMMITMENT} stands there without a case")
     found = [Order(c.name, c / "recordings", out.absolute() / c.name) for c in cases]
-    return found[:limit], commitment
+    return found, commitment
+
+
+def cases_of(folder: Path, limit: int | None) -> list[Path]:
+    """Folders of a set's cases, first ids first."""
+    # Absolute, as a worker's working directory is another.
+    return sorted(case.absolute() for case in folder.glob("case_*") if case.is_dir())[:limit]
 
 
 def run_cases(
