@@ -18,7 +18,6 @@ from pup.diagnosis.fitting import (
     differentiate,
     fit_together,
     start_best,
-    term_coordinate,
 )
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
@@ -26,10 +25,12 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.shortlist import shortlist
-from pup.diagnosis.starts import ROUGHLY, joined, options, without_samples
+from pup.diagnosis.starts import described, joined, options, started, without_samples
 from pup.diagnosis.tracing import traces
 
 Array = NDArray[np.float64]
+Tried = tuple[tuple[Hypothesis, ...], Fit]
+"""A fit under way and the effects it has."""
 
 FIRST, ROUGH, LAST = 2, 5, 14
 """Steps of all finalists until they are compared, of those promising then, and of the best."""
@@ -228,10 +229,9 @@ class Selector:
         ranking = scores(self._traces(model), errors)
         if not ranking or ranking[0].surprise < self.enough:
             return None
-        chosen = shortlist(ranking, self.enough)
-        tried = [self._started(model, score) for score in chosen]
-        places = [options(model.fit, score, f) for score, (_, f) in zip(chosen, tried, strict=True)]
-        start_best([f for _, f in tried], places, self.replays, self.noise)
+        tried = self._begun(model, ranking)
+        if not model.hypotheses:
+            tried += self._elsewhere()
         self._refit(tried, fit.chi2)
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
@@ -240,6 +240,28 @@ class Selector:
         holds = [m for m in finalists if self._holds(model, m)]
         others = [m for m in finalists if m not in holds]
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
+
+    def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
+        """Fits of a model with one effect more, each begun where it is best."""
+        chosen = shortlist(ranking, self.enough)
+        tried = [
+            ((*model.hypotheses, score.trace.hypothesis), started(model.fit, score))
+            for score in chosen
+        ]
+        places = [options(model.fit, score, f) for score, (_, f) in zip(chosen, tried, strict=True)]
+        start_best([f for _, f in tried], places, self.replays, self.noise)
+        return tried
+
+    def _elsewhere(self) -> list[Tried]:
+        """Fits with one effect that begin at the robot as it is described; see `described`."""
+        fit = described(self.nominal.fit, self.replays, self.noise)
+        if fit is None:
+            return []
+        assert fit.jacobian is not None and fit.residual is not None
+        found = traces(hypotheses(self.replays.measured), fit, self.replays, self.noise)
+        errors = Projector(fit.jacobian)(fit.residual[:, None])[:, 0]
+        ranking = scores(found, errors)
+        return self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
 
     def _traces(self, model: Model) -> list[Trace]:
         """Traces of what a model does not have, around it: a large effect changes all others'."""
@@ -269,7 +291,7 @@ class Selector:
         """Chi-squared that wrong forms of a model's effects may leave."""
         return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
 
-    def _refit(self, tried: Sequence[tuple[tuple[Hypothesis, ...], Fit]], start: float) -> None:
+    def _refit(self, tried: Sequence[Tried], start: float) -> None:
         """Refit finalists: all for a first look, the promising roughly, the best to the end.
 
         So are those of the best one's class, for what tells them apart is small, and the first,
@@ -308,28 +330,6 @@ class Selector:
             newest, *both, measured
         )
 
-    def _started(self, model: Model, score: Score) -> tuple[tuple[Hypothesis, ...], Fit]:
-        """A fit of a model with one effect more, where the score test says it lies."""
-        hypothesis = score.trace.hypothesis
-        sizes = np.clip(score.sizes, -3, 3) if hypothesis.signed else np.clip(score.sizes, 0.05, 3)
-        free = hypothesis.magnitudes + hypothesis.continuous
-        coordinates = tuple(term_coordinate(name, hypothesis.scale) for name in free)
-        shape = dict(hypothesis.shape)
-        start = [*sizes, *(c.coordinate(shape[c.name]) for c in coordinates[len(sizes) :])]
-        low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
-        fit = Fit(
-            model.fit.coordinates + coordinates,
-            np.r_[model.fit.at, np.clip(start, low, high)],
-            fixed={**model.fit.fixed, **{n: v for n, v in shape.items() if n not in free}},
-            thorough=False,
-            slack=ROUGHLY,
-        )
-        if not hypothesis.continuous:  # the traces are the Jacobian's columns
-            assert model.fit.jacobian is not None
-            fit.jacobian = np.hstack([model.fit.jacobian, score.trace.whole])
-            fit.age = 1
-        return (*model.hypotheses, hypothesis), fit
-
     def _without(self, model: Model) -> Model:
         """The model less whatever it can do without."""
         while len(model.hypotheses) > 1:
@@ -354,7 +354,7 @@ class Selector:
         fixed = {n: v for n, v in model.fit.fixed.items() if n not in gone}
         return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed, thorough=False)
 
-    def models(self, fitted: Sequence[tuple[tuple[Hypothesis, ...], Fit]]) -> list[Model]:
+    def models(self, fitted: Sequence[Tried]) -> list[Model]:
         """Fitted models with what each fold costs them by fits without it."""
         differentiate([fit for _, fit in fitted if fit.jacobian is None], self.replays, self.noise)
         insides = [self.replays.measured.only(fold) for fold in self.folds]

@@ -4,8 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Score
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fitting import Fit, fit_together, term_coordinate
 from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Noise
 
 Array = NDArray[np.float64]
 
@@ -15,6 +17,31 @@ SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
+UNUSUAL = np.log(3.0)
+"""A nominal parameter further than this from the robot's description may have been led astray."""
+
+
+def started(before: Fit, score: Score) -> Fit:
+    """A fit of a model with one effect more, where the score test says it lies."""
+    hypothesis = score.trace.hypothesis
+    sizes = np.clip(score.sizes, -3, 3) if hypothesis.signed else np.clip(score.sizes, 0.05, 3)
+    free = hypothesis.magnitudes + hypothesis.continuous
+    coordinates = tuple(term_coordinate(name, hypothesis.scale) for name in free)
+    shape = dict(hypothesis.shape)
+    start = [*sizes, *(c.coordinate(shape[c.name]) for c in coordinates[len(sizes) :])]
+    low, high = ([getattr(c, end) for c in coordinates] for end in ("lower", "upper"))
+    fit = Fit(
+        before.coordinates + coordinates,
+        np.r_[before.at, np.clip(start, low, high)],
+        fixed={**before.fixed, **{n: v for n, v in shape.items() if n not in free}},
+        thorough=False,
+        slack=ROUGHLY,
+    )
+    if not hypothesis.continuous:  # the traces are the Jacobian's columns
+        assert before.jacobian is not None
+        fit.jacobian = np.hstack([before.jacobian, score.trace.whole])
+        fit.age = 1
+    return fit
 
 
 def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
@@ -36,6 +63,26 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
         step = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
         places += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
     return places
+
+
+def described(nominal: Fit, replays: Replays, noise: Noise) -> Fit | None:
+    """The robot as it is described, with its Jacobian, where its nominal fit ends far from that.
+
+    What is missing may have driven gains to where no robot has them, and there nothing looks like
+    it: an integral part, for one, hides in a proportional one seven times too large. On the ground
+    it is not asked for, where gains that are far off make a robot fall.
+    """
+    space, measured = replays.space, replays.measured
+    if any(r.support == "ground" for r in measured.recordings):
+        return None
+    at = np.array(
+        [c.coordinate(space.nominal[space.names.index(c.name)]) for c in nominal.coordinates]
+    )
+    if np.abs(at - nominal.at).max() < UNUSUAL:
+        return None
+    fit = Fit(nominal.coordinates, at)
+    fit_together([fit], replays, noise, iterations=0)
+    return fit
 
 
 def joined(fit: Fit, rival: Fit, own: Hypothesis) -> Fit:
