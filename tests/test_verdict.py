@@ -86,6 +86,11 @@ def test_what_every_robot_has_a_little_of_comes_after_what_is_of_a_usual_size() 
     assert in_order([clock, ripple, nameless]) == (ripple, nameless, clock)
 
 
+def test_what_explains_nearly_all_is_first_whatever_its_size() -> None:
+    drag, spring = found("quadratic_damping", 10_200.0, 0.23), found("joint_spring", 220.0, 0.45)
+    assert in_order([spring, drag]) == (drag, spring)
+
+
 def test_findings_stand_by_what_they_explain_where_none_is_of_a_usual_size_for_sure() -> None:
     clock, ripple = found("clock_skew", 8000.0, 0.2), found("cogging", 400.0, 0.4, 0.3)
     nameless = found("unknown", 100.0, np.inf)

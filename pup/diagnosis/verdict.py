@@ -33,6 +33,8 @@ SURE = 1.645
 """Standard deviations of the noise floor that a model may leave beyond it."""
 SLIGHT = 0.25
 """Share of its typical size below which an effect is what every robot has a little of."""
+DOMINANT = 30.0
+"""What explains so many times as much as all others is first whatever its size."""
 WORTH_SAYING = 0.03
 """Alternatives less probable than this are not told."""
 JITTERY = ("command_delay", "measurement_delay")
@@ -198,11 +200,17 @@ def findings(
 def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
     """Findings, most important first: by what they explain.
 
-    Beside an effect of a usual size, those of which every robot has a little come after, however
-    much of the error is theirs: a clock that is off by a little moves everything.
+    Beside an effect of a usual size, those of which every robot has a little come after, though
+    more of the error is theirs (a clock that is off by a little moves everything), unless nearly
+    all of it is.
     """
-    usual = any(f.effect != "unknown" and f.believed and f.size >= SLIGHT for f in found)
-    return tuple(sorted(found, key=lambda f: (usual and f.size < SLIGHT, -f.gain)))
+    usual = [f for f in found if f.effect != "unknown" and f.believed and f.size >= SLIGHT]
+    most = max((f.gain for f in usual), default=np.inf)
+
+    def slight(finding: Finding) -> bool:
+        return bool(usual) and finding.size < SLIGHT and finding.gain < DOMINANT * most
+
+    return tuple(sorted(found, key=lambda f: (slight(f), -f.gain)))
 
 
 def reaches(model: Model) -> Array:
