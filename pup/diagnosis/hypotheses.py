@@ -97,6 +97,10 @@ class Hypothesis:
         ]
 
 
+SEVERAL = frozenset(("scan_delay",))
+"""Effects that need several joints."""
+
+
 def hypotheses(measured: Measured) -> list[Hypothesis]:
     """All hypotheses about some measurements."""
     scale = Scale.of(measured.robot)
@@ -139,6 +143,8 @@ def _places(effect: str, measured: Measured) -> Iterator[Place]:
     robot, kinds = measured.robot, TERMS[effect].kinds
     ground = any(r.support == "ground" for r in measured.recordings)
     one = len(robot.joints) == 1
+    if one and effect in SEVERAL:
+        return
     for kind in kinds:
         if kind == "joint":
             yield from (Place("joint", name) for name in robot.joint_names)

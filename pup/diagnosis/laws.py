@@ -1,6 +1,6 @@
 """What each effect is, in an equation and in plain words."""
 
-from pup.physics.terms import UNLISTED
+from pup.physics.terms import FORMS, UNLISTED
 
 NAMELESS = "unknown"
 """The effect of a finding that the library has no name for."""
@@ -15,6 +15,7 @@ EQUATIONS = {
     "target_rate_limit": "|d goal/dt| <= 1/slowness, |d2 goal/dt2| <= 1/sluggishness",
     "command_delay": "target(t) = command(t - d)",
     "measurement_delay": "reading(t) = q(t - d)",
+    "scan_delay": "reading_k(t) = q_k(t - d k/n), or d (n + 1 - k)/n where d < 0",
     "actuator_lag": "tau = u - kd qdot, du/dt = (tau_m + kd qdot - u)/T",
     "voltage_sag": "tau_m, tau_max: times s; T ds/dt = 1/(1 + c sum |tau|) - s",
     "thermal_drift": "tau_m, tau_max: times 1 - r h, dh/dt = 1 - h/T; by load: |tau|/tau_max - h/T",
@@ -54,6 +55,7 @@ WORDS = {
     "target_rate_limit": "a goal that the firmware moves at a limited speed",
     "command_delay": "commands that arrive late",
     "measurement_delay": "readings that are old",
+    "scan_delay": "servos that are read one after the other",
     "actuator_lag": "a drive that lags behind what is asked for",
     "voltage_sag": "a supply that sags under load",
     "thermal_drift": "gains that drift with run time",
@@ -87,4 +89,4 @@ WORDS = {
 
 def contract_name(effect: str) -> str:
     """An effect as CONTRACTS.md, section 6, names it; what that does not list has no name."""
-    return NAMELESS if effect in UNLISTED else effect
+    return NAMELESS if effect in UNLISTED else FORMS.get(effect, effect)

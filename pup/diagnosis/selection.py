@@ -25,12 +25,19 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.shortlist import shortlist
-from pup.diagnosis.starts import described, joined, options, started, without_samples
+from pup.diagnosis.starts import (
+    Tried,
+    described,
+    distinct,
+    joined,
+    options,
+    puzzling,
+    started,
+    without_samples,
+)
 from pup.diagnosis.tracing import traces
 
 Array = NDArray[np.float64]
-Tried = tuple[tuple[Hypothesis, ...], Fit]
-"""A fit under way and the effects it has."""
 
 FIRST, ROUGH, LAST = 2, 5, 14
 """Steps of all finalists until they are compared, of those promising then, and of the best."""
@@ -230,9 +237,11 @@ class Selector:
         if not ranking or ranking[0].surprise < self.enough:
             return None
         tried = self._begun(model, ranking)
-        if not model.hypotheses:
-            tried += self._elsewhere()
         self._refit(tried, fit.chi2)
+        if not model.hypotheses and puzzling(fit, tried):
+            elsewhere = self._elsewhere()
+            self._refit(elsewhere, fit.chi2)
+            tried = distinct([*tried, *elsewhere])
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
             return Round(model, tuple(ranking), (), 0)
@@ -297,6 +306,8 @@ class Selector:
         So are those of the best one's class, for what tells them apart is small, and the first,
         which the score test has put there.
         """
+        if not tried:
+            return
         fits = [fit for _, fit in tried]
         fit_together(fits, self.replays, self.noise, iterations=FIRST)
         seen = min(fit.chi2 for fit in fits)

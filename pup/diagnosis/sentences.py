@@ -323,6 +323,11 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     "measurement_delay": lambda f: (
         f"Readings of {f.at} are {f.speech.quantity(f.size['time'], 's')} old."
     ),
+    "scan_delay": lambda f: (
+        "Servos are read one after the other: from the "
+        f"{'first to the last' if f.size['time'] > 0 else 'last to the first'} joint their "
+        f"readings grow older, by {f.speech.quantity(abs(f.size['time']), 's')} in all."
+    ),
     "actuator_lag": lambda f: (
         f"What drives {f.at} lags {f.speech.quantity(f.size['time'], 's')} behind what the "
         "controller asks for."

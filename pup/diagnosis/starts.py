@@ -1,5 +1,7 @@
 """Where fits of finalists start: from a model, a score, a rival, or all samples."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,8 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
 
 Array = NDArray[np.float64]
+Tried = tuple[tuple[Hypothesis, ...], Fit]
+"""A fit under way and the effects it has."""
 
 ROUGHLY = 1e-3
 """Relative gain of chi-squared at which a finalist's fit may end."""
@@ -17,6 +21,9 @@ SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
+PUZZLING = 0.5
+"""Where the best of all effects leaves this share of what is more than noise, they are begun
+elsewhere too."""
 UNUSUAL = np.log(3.0)
 """A nominal parameter further than this from the robot's description may have been led astray."""
 
@@ -63,6 +70,22 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
         step = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
         places += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
     return places
+
+
+def puzzling(before: Fit, tried: Sequence[Tried]) -> bool:
+    """Whether no effect explains much of what a fit leaves beyond noise."""
+    assert before.residual is not None
+    noise = len(before.residual)
+    least = min((fit.chi2 for _, fit in tried), default=before.chi2)
+    return least - noise > PUZZLING * (before.chi2 - noise)
+
+
+def distinct(tried: Sequence[Tried]) -> list[Tried]:
+    """The best fit of each newest effect at each place, of each of its choices."""
+    best: dict[object, Tried] = {}
+    for one in sorted(tried, key=lambda one: one[1].chi2):
+        best.setdefault((one[0][-1].key, one[0][-1].choices), one)
+    return list(best.values())
 
 
 def described(nominal: Fit, replays: Replays, noise: Noise) -> Fit | None:

@@ -50,6 +50,7 @@ from pup.physics.terms.sensing import (
     ImuDelay,
     ImuMisalignment,
     MeasurementDelay,
+    ScanDelay,
 )
 from pup.physics.terms.timing import ClockSkew, CommandDelay
 from pup.physics.terms.transmission import (
@@ -100,6 +101,7 @@ TERMS: dict[str, type[Term]] = {
         EncoderBias,
         EncoderEccentricity,
         MeasurementDelay,
+        ScanDelay,
         ImuMisalignment,
         ImuDelay,
         GroundCompliance,
@@ -115,7 +117,7 @@ CLASSES: dict[str, tuple[str, ...]] = {
     "load_friction": ("load_dependent_friction", "gear_efficiency"),
     "speed_loss": ("quadratic_damping", "torque_speed_limit"),
     "rate_limit": ("target_rate_limit",),
-    "delay": ("command_delay", "measurement_delay", "actuator_lag"),
+    "delay": ("command_delay", "measurement_delay", "scan_delay", "actuator_lag"),
     "supply": ("voltage_sag",),
     "drift": ("thermal_drift",),
     "ripple": ("cogging",),
@@ -137,6 +139,8 @@ CLASSES: dict[str, tuple[str, ...]] = {
 }
 UNLISTED = frozenset(("derivative_kick",))
 """Effects that the contract has no name for; documents call them `unknown` and give their law."""
+FORMS = {"scan_delay": "measurement_delay"}
+"""Effects that are a form of one that the contract names."""
 CLASS_OF = {effect: name for name, effects in CLASSES.items() for effect in effects}
 
 
@@ -363,6 +367,7 @@ def _names(kind: Kind, robot: RobotDescription, scene: Scene) -> Sequence[str]:
 __all__ = [
     "CLASSES",
     "CLASS_OF",
+    "FORMS",
     "TERMS",
     "UNLISTED",
     "Drivetrain",

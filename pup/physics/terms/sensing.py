@@ -65,6 +65,25 @@ class MeasurementDelay(Term):
         return self.values["time"]
 
 
+class ScanDelay(Term):
+    """Servos are read one after the other, in the order of the joints, or from the last to first.
+
+    A row holds the first one's position of a moment ago, and the last one's of the whole scan ago;
+    where the time is negative it is the other way round.
+    """
+
+    effect = "scan_delay"
+    kinds = ("bus",)
+    quantities = (Quantity("time", "s", 0.01, 0.06, signed=True),)
+    source = "reading 20 servos one after the other takes 10 ms (paper, section III)"
+
+    def delay(self) -> Array:
+        """See Term."""
+        time = self.values["time"]
+        share = np.arange(1, time.shape[1] + 1) / time.shape[1]
+        return np.asarray(np.abs(time) * np.where(time > 0, share, share[::-1]))
+
+
 class ImuMisalignment(Term):
     """The IMU is mounted with a turn against its site."""
 
