@@ -35,8 +35,9 @@ FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
 """Frictions that a fit may start from on the ground."""
 SPREAD = 0.35
 """Of the starts around the nominal values, in logarithms."""
-NEAR = 0.1
-"""Spread of a start around the best fit, where far ones disagree."""
+NEAR = (0.1, 0.025)
+"""Spreads of starts around the best fit, where far ones disagree. The second is for the ground,
+where a start may make the robot fall, which leads nowhere."""
 AGREEMENT = 3e-3
 """Two starts agree in chi-squared to this share of it, to ABSOLUTE, to SPARE of the noise, or to
 EXCESS of what is more than noise: where much is missing, a fit has many ends that lack it all the
@@ -130,13 +131,10 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     noise = noise_floor(measured, measured.values - replays([tried[0].row()])[0])
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
-    if not _agree(*fits):
-        best = min(fits, key=lambda fit: fit.chi2)
-        others = [_nearby(best, rng) for _ in range(2)]
-        _begun(others[1:], replays, noise)  # how recordings begin may lead to it, or away
-        fits = [best, *others]
-        fit_together(fits, replays, noise)
-        fits = sorted(fits, key=lambda fit: fit.chi2)[:2]
+    for away in NEAR if ground else NEAR[:1]:
+        if _agree(*fits):
+            break
+        fits = _around(min(fits, key=lambda fit: fit.chi2), away, replays, noise, rng)
     for width in WIDER:
         if _agree(*fits):
             break
@@ -259,10 +257,19 @@ def _start(
     return Fit(tuple(coordinates), _within(coordinates, np.array(at)), slack=ROUGH)
 
 
-def _nearby(fit: Fit, rng: np.random.Generator) -> Fit:
-    """A start near a fit: contact has many hollows, and the deepest must draw what is near it."""
-    away = NEAR * rng.normal(size=len(fit.at))
-    return Fit(fit.coordinates, _within(fit.coordinates, fit.at + away))
+def _around(
+    best: Fit, away: float, replays: Replays, noise: Noise, rng: np.random.Generator
+) -> list[Fit]:
+    """The best two of a fit and of two that start near it.
+
+    Contact has many hollows, and the deepest must draw what is near it.
+    """
+    places = [best.at + away * rng.normal(size=len(best.at)) for _ in range(2)]
+    others = [Fit(best.coordinates, _within(best.coordinates, at)) for at in places]
+    _begun(others[1:], replays, noise)  # how recordings begin may lead to it, or away
+    fits = [best, *others]
+    fit_together(fits, replays, noise)
+    return sorted(fits, key=lambda fit: fit.chi2)[:2]
 
 
 def _within(coordinates: Sequence[Coordinate], at: Array) -> Array:
