@@ -1,0 +1,64 @@
+"""Where fits of finalists begin: near the nominal fit, and at the robot's description."""
+
+import numpy as np
+import pytest
+
+from pup.diagnosis.fitting import Fit, fit_together, nominal_coordinate
+from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.noise import assumed_noise
+from pup.diagnosis.nominal import free_names
+from pup.diagnosis.replays import Bench, Replays, threads
+from pup.diagnosis.residuals import Measured
+from pup.diagnosis.starts import described, distinct, puzzling
+from pup.physics.parameters import robot_space
+from tests.diagnosis_cases import BENCH, recordings
+
+SPACE = robot_space(BENCH, "pd")
+MISSING = {"integral_action/gain@joint:servo": 8.5, "integral_action/share@joint:servo": 0.3}
+
+
+@pytest.fixture(scope="module")
+def replays() -> Replays:
+    measured = Measured.of(BENCH, recordings(MISSING))
+    return Replays(measured, SPACE, threads(Bench(measured), 1), 1)
+
+
+def nominal(**changed: float) -> Fit:
+    """A nominal model by its values; those not given are the description's."""
+    coordinates = tuple(nominal_coordinate(SPACE, n) for n in free_names(SPACE, ground=False))
+    values = {n: float(SPACE.nominal[SPACE.names.index(n)]) for n in SPACE.names} | changed
+    return Fit(coordinates, np.array([c.coordinate(values[c.name]) for c in coordinates]))
+
+
+def test_a_fit_that_ends_far_from_the_description_is_begun_there_too(replays: Replays) -> None:
+    noise = assumed_noise(replays.measured)
+    assert described(nominal(), replays, noise) is None
+    assert described(nominal(**{"kp/servo": 6.0}), replays, noise) is None
+    fit = described(nominal(**{"kp/servo": 20.0}), replays, noise)
+    assert fit is not None and fit.jacobian is not None
+    assert fit.values["kp/servo"] == pytest.approx(3.84)
+    assert np.isfinite(fit.chi2)
+
+
+def test_what_explains_little_of_what_is_left_is_a_puzzle(replays: Replays) -> None:
+    noise = assumed_noise(replays.measured)
+    before, after = nominal(), nominal()
+    fit_together([before], replays, noise, iterations=0)
+    excess = before.chi2 - len(replays.measured.values)
+    assert excess > 0
+    for share, puzzle in ((0.9, True), (0.2, False)):
+        after.chi2 = len(replays.measured.values) + share * excess
+        assert puzzling(before, [((), after)]) is puzzle
+    assert puzzling(before, [])
+
+
+def test_of_fits_with_the_same_effect_the_best_counts(replays: Replays) -> None:
+    lag, other = [
+        next(h for h in hypotheses(replays.measured) if h.effect == name)
+        for name in ("actuator_lag", "backlash")
+    ]
+    fits = [nominal(), nominal(), nominal()]
+    for fit, chi2 in zip(fits, (30.0, 20.0, 25.0), strict=True):
+        fit.chi2 = chi2
+    told = distinct(list(zip([(lag,), (lag,), (other,)], fits, strict=True)))
+    assert [(h[-1].effect, f.chi2) for h, f in told] == [("actuator_lag", 20.0), ("backlash", 25.0)]
