@@ -26,6 +26,7 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.shortlist import shortlist
 from pup.diagnosis.starts import (
+    CLOSELY,
     Tried,
     described,
     distinct,
@@ -324,7 +325,7 @@ class Selector:
             or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
         ]
         for fit in close:
-            fit.thorough, fit.done, fit.jacobian = True, False, None
+            fit.thorough, fit.done, fit.jacobian, fit.slack = True, False, None, CLOSELY
         fit_together(close, self.replays, self.noise, iterations=LAST)
 
     def _holds(self, before: Model, after: Model) -> bool:

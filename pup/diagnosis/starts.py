@@ -15,8 +15,9 @@ Array = NDArray[np.float64]
 Tried = tuple[tuple[Hypothesis, ...], Fit]
 """A fit under way and the effects it has."""
 
-ROUGHLY = 1e-3
-"""Relative gain of chi-squared at which a finalist's fit may end."""
+ROUGHLY, CLOSELY = 1e-3, 1e-4
+"""Relative gain of chi-squared at which a finalist's fit may end: at first, and to be compared with
+others, which differ by less than what a step in a narrow valley gains."""
 SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
 DAMPED, FURTHEST = 0.01, 0.5
