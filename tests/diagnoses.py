@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pup.diagnosis.coordinates import nominal_coordinate, term_coordinate
 from pup.diagnosis.discover import Unexplained
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Trace, scores
-from pup.diagnosis.fitting import Fit, nominal_coordinate, term_coordinate
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.impulses import WRENCH_NAMES
 from pup.diagnosis.lacks import Lack

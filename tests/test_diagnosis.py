@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pup.diagnosis import selection
+from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.engine import Diagnosis, diagnose
 from pup.diagnosis.evidence import Projector, scores, threshold
-from pup.diagnosis.fitting import ENOUGH, Coordinate, Fit, fit_together
+from pup.diagnosis.fitting import ENOUGH, Fit, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.noise import noise_floor, quanta, quiet_noise
 from pup.diagnosis.replays import Batch, Bench, Replays, threads

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.experiment import (
     NextRecording,
     Pair,
@@ -11,7 +12,7 @@ from pup.diagnosis.experiment import (
     recorded_again,
     recorded_besides,
 )
-from pup.diagnosis.fitting import Fit, term_coordinate
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.menu import options
 from pup.diagnosis.residuals import Noise
 from pup.physics.terms import Place, column

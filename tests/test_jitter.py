@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pup.diagnosis.fitting import Fit, term_coordinate
+from pup.diagnosis.coordinates import term_coordinate
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.residuals import Measured

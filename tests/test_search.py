@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pup.diagnosis.fitting import Fit, nominal_coordinate
+from pup.diagnosis.coordinates import nominal_coordinate
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Certificate, Nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, pieces

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pup.diagnosis.fitting import Fit, fit_together, nominal_coordinate
+from pup.diagnosis.coordinates import nominal_coordinate
+from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import free_names

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rivals.case import Case, Named, Verdict
-from pup.diagnosis.fitting import Fit, fit_together, start_best, term_coordinate
+from pup.diagnosis.coordinates import term_coordinate
+from pup.diagnosis.fitting import Fit, fit_together, start_best
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.starts import ROUGHLY
 from pup.diagnosis.verdict import WORTH_SAYING

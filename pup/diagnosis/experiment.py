@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import Fit, difference, fit_together, term_coordinate
+from pup.diagnosis.coordinates import term_coordinate
+from pup.diagnosis.fitting import Fit, difference, fit_together
 from pup.diagnosis.laws import WORDS, contract_name
 from pup.diagnosis.menu import Option, options
 from pup.diagnosis.replays import Replays, Row

@@ -11,12 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.probing import changes, probed
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
-from pup.physics.parameters import ParameterSpace
-from pup.physics.terms import TERMS, split_column
-from pup.physics.terms.scale import Scale
 
 Array = NDArray[np.float64]
 
@@ -26,8 +24,6 @@ DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
 """Tried at once, relative to the current one: at first, and where that led nowhere."""
 ENOUGH = 0.2
 """A fit has ended when no step lowers chi-squared by as much."""
-SIGNED = 0.01
-"""A shape that may be negative, such as an angle, has this share of its limit at coordinate 1."""
 ALMOST = 1e-9
 CHEAP = 100
 """Simulations that a replay may have beside those it needs, for Jacobians of its trials."""
@@ -35,63 +31,6 @@ RELIABLE = 0.5
 """Share of what it promised that a step must gain for its Jacobian to be kept."""
 PATIENCE = 2
 """Accepted steps for which an updated Jacobian is trusted."""
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """One free parameter and the coordinate it is fitted in.
-
-    Attributes:
-      name: the parameter.
-      scale: its size at coordinate 1, in its unit; None where the coordinate is its logarithm.
-      lower: smallest coordinate.
-      upper: largest coordinate.
-    """
-
-    name: str
-    scale: float | None
-    lower: float
-    upper: float
-
-    def value(self, coordinate: float) -> float:
-        """The parameter, in its unit."""
-        return float(np.exp(coordinate) if self.scale is None else coordinate * self.scale)
-
-    def coordinate(self, value: float) -> float:
-        """Where a value lies."""
-        told = np.log(max(value, 1e-300)) if self.scale is None else value / self.scale
-        return float(np.clip(told, self.lower, self.upper))
-
-    def slope(self, coordinate: float) -> float:
-        """The parameter's change per change of the coordinate."""
-        return float(np.exp(coordinate)) if self.scale is None else self.scale
-
-
-def nominal_coordinate(space: ParameterSpace, name: str) -> Coordinate:
-    """The coordinate of a nominal parameter, which is positive."""
-    i = space.names.index(name)
-    low = max(space.lower[i], 1e-4 * space.upper[i])
-    return Coordinate(name, None, float(np.log(low)), float(np.log(space.upper[i])))
-
-
-def term_coordinate(name: str, scale: Scale) -> Coordinate:
-    """The coordinate of a term's quantity on a robot of some strength."""
-    told = split_column(name)
-    assert told is not None
-    quantity = next(q for q in TERMS[told[0]].quantities if q.name == told[1])
-    factor = scale.factor(quantity.unit)
-    if quantity.shape and quantity.signed:
-        width = SIGNED * quantity.limit
-        return Coordinate(name, width * factor, quantity.lower / width, quantity.limit / width)
-    if quantity.shape:
-        lower, upper = np.log(quantity.lower * factor), np.log(quantity.limit * factor)
-        return Coordinate(name, None, float(lower), float(upper))
-    return Coordinate(
-        name,
-        quantity.typical * factor,
-        quantity.lower / quantity.typical,
-        quantity.limit / quantity.typical,
-    )
 
 
 @dataclass

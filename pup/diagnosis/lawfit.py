@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.evidence import Projector
-from pup.diagnosis.fitting import Coordinate, Fit
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.impulses import Responses
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.signals import Servo, servos, signals

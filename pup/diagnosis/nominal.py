@@ -10,14 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import (
-    Coordinate,
-    Fit,
-    differentiate,
-    fit_together,
-    nominal_coordinate,
-    start_best,
-)
+from pup.diagnosis.coordinates import Coordinate, nominal_coordinate
+from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
 from pup.diagnosis.noise import noise_floor
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.coordinates import Coordinate, nominal_coordinate
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.fitting import Coordinate, Fit, fit_together, nominal_coordinate
+from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured
 from pup.diagnosis.selection import Selector

@@ -11,14 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
-from pup.diagnosis.fitting import (
-    Coordinate,
-    Fit,
-    differentiate,
-    fit_together,
-    start_best,
-)
+from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses

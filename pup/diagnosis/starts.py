@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.evidence import Score
-from pup.diagnosis.fitting import Fit, fit_together, term_coordinate
+from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
