@@ -3,13 +3,17 @@
 What is positive is fitted by its logarithm, an effect's magnitudes in their typical sizes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pup.physics.parameters import ParameterSpace
 from pup.physics.terms import TERMS, split_column
 from pup.physics.terms.scale import Scale
+
+Array = NDArray[np.float64]
 
 SIGNED = 0.01
 """A shape that may be negative, such as an angle, has this share of its limit at coordinate 1."""
@@ -50,6 +54,12 @@ def nominal_coordinate(space: ParameterSpace, name: str) -> Coordinate:
     i = space.names.index(name)
     low = max(space.lower[i], 1e-4 * space.upper[i])
     return Coordinate(name, None, float(np.log(low)), float(np.log(space.upper[i])))
+
+
+def described_at(coordinates: Sequence[Coordinate], space: ParameterSpace) -> Array:
+    """Where the robot as it is described lies, shape (n_coordinates,)."""
+    values = (space.nominal[space.names.index(c.name)] for c in coordinates)
+    return np.array([c.coordinate(v) for c, v in zip(coordinates, values, strict=True)])
 
 
 def term_coordinate(name: str, scale: Scale) -> Coordinate:

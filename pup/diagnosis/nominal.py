@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.coordinates import Coordinate, nominal_coordinate
+from pup.diagnosis.coordinates import Coordinate, described_at, nominal_coordinate
 from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
 from pup.diagnosis.noise import noise_floor
 from pup.diagnosis.replays import Replays
@@ -244,11 +244,8 @@ def _start(
     rng: np.random.Generator,
 ) -> Fit:
     """A rough fit from somewhere around the nominal values."""
-    at = [
-        c.coordinate(space.nominal[space.names.index(c.name)]) + spread * rng.normal()
-        for c in coordinates
-    ]
-    return Fit(tuple(coordinates), _within(coordinates, np.array(at)), slack=ROUGH)
+    at = described_at(coordinates, space) + spread * rng.normal(size=len(coordinates))
+    return Fit(tuple(coordinates), _within(coordinates, at), slack=ROUGH)
 
 
 def _around(

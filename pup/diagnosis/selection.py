@@ -227,9 +227,7 @@ class Selector:
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
-        assert fit.jacobian is not None and fit.residual is not None
-        errors = Projector(fit.jacobian)(fit.residual[:, None])[:, 0]
-        ranking = scores(self._traces(model), errors)
+        ranking = scores(self._traces(model), _unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
             return None
         tried = self._begun(model, ranking)
@@ -262,10 +260,8 @@ class Selector:
         fit = described(self.nominal.fit, self.replays, self.noise)
         if fit is None:
             return []
-        assert fit.jacobian is not None and fit.residual is not None
         found = traces(hypotheses(self.replays.measured), fit, self.replays, self.noise)
-        errors = Projector(fit.jacobian)(fit.residual[:, None])[:, 0]
-        ranking = scores(found, errors)
+        ranking = scores(found, _unimitated(fit))
         return self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
 
     def _traces(self, model: Model) -> list[Trace]:
@@ -394,3 +390,9 @@ class Selector:
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
     return {hypothesis.effect for hypothesis in hypotheses}
+
+
+def _unimitated(fit: Fit) -> Array:
+    """What a fit leaves that none of its own coordinates can imitate, shape (n_samples,)."""
+    assert fit.jacobian is not None and fit.residual is not None
+    return Projector(fit.jacobian)(fit.residual[:, None])[:, 0]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.coordinates import term_coordinate
+from pup.diagnosis.coordinates import described_at, term_coordinate
 from pup.diagnosis.evidence import Score
 from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.hypotheses import Hypothesis
@@ -97,12 +97,9 @@ def described(nominal: Fit, replays: Replays, noise: Noise) -> Fit | None:
     it: an integral part, for one, hides in a proportional one seven times too large. On the ground
     it is not asked for, where gains that are far off make a robot fall.
     """
-    space, measured = replays.space, replays.measured
-    if any(r.support == "ground" for r in measured.recordings):
+    if any(r.support == "ground" for r in replays.measured.recordings):
         return None
-    at = np.array(
-        [c.coordinate(space.nominal[space.names.index(c.name)]) for c in nominal.coordinates]
-    )
+    at = described_at(nominal.coordinates, replays.space)
     if np.abs(at - nominal.at).max() < UNUSUAL:
         return None
     fit = Fit(nominal.coordinates, at)
