@@ -3,6 +3,7 @@
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import httpx
 import psutil
@@ -216,8 +217,9 @@ def test_an_operator_holds_the_gate(service):
         assert http.post("/v1/studies/gated/trials/1:release").status_code == 200
         assert http.post("/v1/studies/gated/trials/1:release").status_code in (200, 409)
         until(lambda: http.get("/v1/studies/gated").json()["walks"] == 1)
-        assert http.post("/v1/agents/gate-1:stop", json={"reason": "smoke"}).status_code == 202
-        until(lambda: agent.state == "stopped")
+        stop = partial(http.post, "/v1/agents/gate-1:stop", json={"reason": "smoke"})
+        until(lambda: stop().status_code == 202)  # 409 while the robot has not said that it did
+        assert agent.state == "stopped"
         until(lambda: "stopped" in [a["state"] for a in http.get("/v1/agents").json()["agents"]])
         until(lambda: http.get("/v1/studies/gated").json()["state"] == "paused")
         assert http.post("/v1/studies/gated:resume").status_code == 200

@@ -245,7 +245,8 @@ def test_a_study_that_cannot_go_on_says_so_and_goes_on_when_it_can(tmp_path):
         conductor.tick()
         while not conductor.studies["s"].trials:
             await asyncio.sleep(0.01)
-        assert "failed" not in conductor.waits_for(conductor.studies["s"])
+        while "failed" in conductor.waits_for(conductor.studies["s"]):  # until that look has ended
+            await asyncio.sleep(0.01)
         store.close()
 
     asyncio.run(asyncio.wait_for(live(), 120))

@@ -2,7 +2,15 @@
 
 from dataclasses import replace
 
-from pup.transfer.study import TOLD, Study, StudyState, Trial, TrialError, TrialState
+from pup.transfer.study import (
+    HANDED_OUT,
+    TOLD,
+    Study,
+    StudyState,
+    Trial,
+    TrialError,
+    TrialState,
+)
 
 
 def release(study: Study, number: int) -> Study:
@@ -40,6 +48,16 @@ def cancel(study: Study, number: int, reason: str) -> Study:
     requested = trial.state is TrialState.REQUESTED
     trial = trial.withdraw(reason) if requested else trial.recall()
     return pause(study.with_trial(trial), f"trial {number}: {reason}")
+
+
+def halt(study: Study, agent: str, reason: str) -> Study:
+    """A robot was stopped: have it end its trial, and make none for it."""
+    if study.state is StudyState.DONE:
+        return study
+    if study.open and study.open.agent == agent and study.open.state in HANDED_OUT:
+        return cancel(study, study.open.number, reason)
+    waits = study.settings.agent == agent and study.state is StudyState.ACTIVE
+    return pause(study, reason) if waits else study
 
 
 def after_end(study: Study, last: Trial) -> Study:

@@ -194,13 +194,11 @@ class Conductor:
         view.stop = Stop(f"{who}: {reason}")
         self.send(agent, view.stop)
         told = f"{agent} was stopped by {who}: {reason}"
-        for study in list(self.studies.values()):
-            if study.state is StudyState.DONE:
-                continue
-            if study.open and study.open.agent == agent and study.open.state in HANDED_OUT:
-                await self.cancel(study.name, study.open.number, who, told)
-            elif study.settings.agent == agent and study.state is StudyState.ACTIVE:
-                await self.change(study.name, who, partial(orders.pause, reason=told), "paused")
+        for name in list(self.studies):
+            order = partial(orders.halt, agent=agent, reason=told)
+            study = await self.change(name, who, order, "stopped")
+            if study.open:
+                self._recall(study.open)
         await self.store.log([Event("stopped", who, detail={"agent": agent, "reason": reason})])
         end = time.monotonic() + CONFIRMED
         while view.stop and view.present and time.monotonic() < end:
