@@ -126,6 +126,13 @@ def diagnose(verb: argparse.ArgumentParser) -> None:
         help="missing effects that are looked for at most, one after the other, minutes for each "
         "where a robot has many joints; default: 8",
     )
+    verb.add_argument(
+        "--seconds",
+        type=number(1.0, 1e6, float),
+        metavar="S",
+        help="of each recording that are used, from its start; time and memory grow with them; "
+        "default: all",
+    )
     seed(verb)
     place(verb)
 

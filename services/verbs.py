@@ -173,6 +173,7 @@ def _walk(options: argparse.Namespace) -> dict[str, Any]:
 
 def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
     from pup.recording import load_recordings
+    from pup.recording_cuts import beginning
     from services.diagnosis import run_diagnosis
     from services.progress import stages
 
@@ -182,6 +183,8 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
         )
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
+    if options.seconds is not None:
+        recordings = [beginning(recording, options.seconds) for recording in recordings]
     with _folder(options.out) as out, places.replays(options) as where, stages() as progress:
         return run_diagnosis(
             robot,

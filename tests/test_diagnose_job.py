@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pup.diagnosis.replays import Batch, Bench, Replays, Runner, threads
 from pup.diagnosis.residuals import Measured
 from pup.physics.parameters import robot_space
-from pup.recording import write_recordings
+from pup.recording import load_recordings, write_recordings
+from pup.recording_cuts import beginning
 from services.diagnosis import Where, alone, keeper, run_diagnosis
 from services.stopwatch import Stopwatch
 
@@ -150,3 +151,15 @@ def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path
     assert asked == [1, 1, 0]
     assert np.array_equal(answers[0], answers[2])
     assert not np.array_equal(answers[0], answers[1])
+
+
+def test_the_beginning_of_long_recordings_is_enough(runs: Path, tmp_path: Path) -> None:
+    """`--seconds`: the page says of what it is."""
+    where = ("--local", "--effects", 1, "--seconds", 1.2, "--out", tmp_path)
+    done = pup("diagnose", runs, "--robot", "servo_bench", *where)
+    assert done.code == 0, done.err
+    page = (tmp_path / "report.html").read_text()
+    for recording in load_recordings([runs]):
+        cut = beginning(recording, 1.2)
+        assert cut.time[-1] - cut.time[0] < 1.2 < recording.time[-1] - recording.time[0]
+        assert cut.digest in page and recording.digest not in page
