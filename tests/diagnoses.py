@@ -15,10 +15,10 @@ from pup.diagnosis.impulses import WRENCH_NAMES
 from pup.diagnosis.lacks import Lack
 from pup.diagnosis.lawfit import Law
 from pup.diagnosis.locate import MissingInput
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Certificate, Nominal, free_names
 from pup.diagnosis.regimes import Regime, Window
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import Model, Round
 from pup.diagnosis.splits import Ratio, Split
 from pup.diagnosis.verdict import Alternative, Finding, Parameter, held_out
 from pup.physics.parameters import robot_space

@@ -7,8 +7,8 @@ from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.jitter import jitter
+from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.selection import Model
 from pup.diagnosis.verdict import unexplained_errors
 from tests.diagnosis_cases import BENCH, recordings
 

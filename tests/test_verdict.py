@@ -6,8 +6,8 @@ import pytest
 from pup.diagnosis.evidence import Score, Trace
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import Model, Round
 from pup.diagnosis.verdict import (
     Finding,
     doubt,

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.models import Model
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Nominal, fit_nominal
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import Model, Selector
+from pup.diagnosis.selection import Selector
 from pup.diagnosis.verdict import Alternative, Finding, HeldOut, held_out
 from pup.physics.parameters import robot_space
 from pup.physics.terms import Place

@@ -16,9 +16,10 @@ from pup.diagnosis.impulses import BUDGET, responses
 from pup.diagnosis.lacks import Lack, lack_of_fit
 from pup.diagnosis.lawfit import LAWS, Law, laws
 from pup.diagnosis.locate import BAND, MissingInput, explained_by
+from pup.diagnosis.models import Model
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.selection import KEPT, Model, Selector
+from pup.diagnosis.selection import KEPT, Selector
 from pup.diagnosis.verdict import (
     UNKNOWN,
     Finding,

@@ -19,6 +19,7 @@ from pup.diagnosis.experiment import (
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.noise import assumed_noise, quiet_noise
 from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
@@ -27,7 +28,7 @@ from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.search import Search, followed, search
-from pup.diagnosis.selection import Model, Round, Selector
+from pup.diagnosis.selection import Selector
 from pup.diagnosis.splits import Split, splits
 from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out, in_order
 from pup.physics.actuators import per_joint

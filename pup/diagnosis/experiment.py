@@ -17,9 +17,10 @@ from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.fitting import Fit, difference, fit_together
 from pup.diagnosis.laws import WORDS, contract_name
 from pup.diagnosis.menu import Option, options
+from pup.diagnosis.models import Round
 from pup.diagnosis.replays import Replays, Row
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import Round, Selector
+from pup.diagnosis.selection import Selector
 from pup.diagnosis.verdict import Finding
 from pup.physics.terms import Place, split_column
 from pup.robot import RobotDescription

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pup.diagnosis.lacks import repeated
-from pup.diagnosis.selection import Model
+from pup.diagnosis.models import Model
 from pup.physics.terms import CLASS_OF, split_column
 
 Array = NDArray[np.float64]

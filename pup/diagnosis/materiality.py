@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import Noise
-from pup.diagnosis.selection import Model
 from pup.diagnosis.verdict import HeldOut
 
 Array = NDArray[np.float64]

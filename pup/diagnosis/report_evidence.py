@@ -10,8 +10,8 @@ from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Score
 from pup.diagnosis.figures import gains, likeness, masking, ranking_bars
 from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.models import Round
 from pup.diagnosis.search import FALSE_ALARMS
-from pup.diagnosis.selection import Round
 from pup.diagnosis.wording import (
     Speech,
     capital,

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from pup.diagnosis.evidence import Trace, threshold
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Nominal
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.selection import Model, Round, Selector
+from pup.diagnosis.selection import Selector
 from pup.diagnosis.tracing import traces
 from pup.physics.terms.scale import Scale
 

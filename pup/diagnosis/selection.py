@@ -6,26 +6,27 @@ by more than chance and predict types of motion that were left out; then each is
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
+from pup.diagnosis.exchanges import rivalled, widened
 from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
-from pup.diagnosis.residuals import LOST, Measured, Noise
+from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.shortlist import shortlist
 from pup.diagnosis.starts import (
     CLOSELY,
     Tried,
     described,
     distinct,
-    joined,
+    less,
     options,
     puzzling,
     started,
@@ -44,8 +45,8 @@ CLOSE, MARGIN = 4, 40.0
 LEADING = 400
 """Hypotheses that are simulated again around a model that has an effect more: where there are more,
 those that looked most like its errors before."""
-SWAPS, RIVALS = 2, 2
-"""Effects that may be exchanged, and rivals that each may be exchanged for."""
+SWAPS = 2
+"""Effects that may be exchanged."""
 PLACES = 16
 """Places that all effects together may act at."""
 KEPT = 0.25
@@ -53,72 +54,6 @@ KEPT = 0.25
 FORM = 0.03
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
 is no evidence of another."""
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """The nominal model with some effects, fitted.
-
-    Attributes:
-      hypotheses: the effects, in the order in which they were found.
-      freedom: of their magnitudes and shapes, how many the data see.
-      fit: of nominal parameters and effects together.
-      held_out: what each fold costs by a fit without it, shape (n_folds,); see `folds.left_out`.
-      measured: the samples that it was fitted to.
-      predicted: what those fits predict, shape (n_samples,), rad; empty where nobody has asked.
-      refits: their coordinates, shape (n_folds, n_free); empty likewise.
-    """
-
-    hypotheses: tuple[Hypothesis, ...]
-    freedom: int
-    fit: Fit
-    held_out: Array
-    measured: Measured
-    predicted: Array = field(default_factory=lambda: np.empty(0))
-    refits: Array = field(default_factory=lambda: np.empty((0, 0)))
-
-    @property
-    def samples(self) -> int:
-        """Samples that it was fitted to."""
-        return 0 if self.fit.residual is None else len(self.fit.residual)
-
-    def size(self, hypothesis: Hypothesis) -> float:
-        """Size of the largest magnitude of one of its effects, in what is typical of its kind."""
-        at = dict(zip(self.fit.names, self.fit.at, strict=True))
-        return max(abs(float(at[name])) for name in hypothesis.magnitudes)
-
-    @property
-    def worth(self) -> float:
-        """What it explains: half its chi-squared in sample, half out of it, and its complexity."""
-        inside = self.fit.chi2 + self.freedom * float(np.log(self.samples))
-        return (inside + float(self.held_out.sum())) / 2
-
-
-@dataclass(frozen=True, eq=False)
-class Round:
-    """One effect's choice.
-
-    Attributes:
-      before: the model it was added to.
-      ranking: what the score test said, best first.
-      finalists: the models refitted, best first: those that hold, then the others.
-      holding: how many of them hold; with any, the first was added.
-    """
-
-    before: Model
-    ranking: tuple[Score, ...]
-    finalists: tuple[Model, ...]
-    holding: int
-
-    @property
-    def accepted(self) -> bool:
-        """Whether an effect was added."""
-        return self.holding > 0
-
-    @property
-    def chosen(self) -> Hypothesis:
-        """The effect that was found best."""
-        return self.finalists[0].hypotheses[-1]
 
 
 class Selector:
@@ -183,33 +118,24 @@ class Selector:
         return model
 
     def _swap(self, model: Model, rounds: Sequence[Round]) -> Round | None:
-        """An effect exchanged for a rival of its own round, where what came later prefers that.
+        """An effect exchanged for a rival of its own round, or several for one at all their places.
 
         The first effects are chosen while others still hide; the last knows all of them.
         """
-        owners, tried = [], []
-        for hypothesis in model.hypotheses[:-1]:
-            chosen = [r for r in rounds if r.accepted and r.chosen.key == hypothesis.key]
-            if not chosen:
-                continue
-            others = tuple(h for h in model.hypotheses if h is not hypothesis)
-            known = {h.key for h in model.hypotheses}
-            rivals = [m for m in chosen[-1].finalists[1:] if m.hypotheses[-1].key not in known]
-            for rival in rivals[:RIVALS]:
-                owners.append((chosen[-1], hypothesis, others))
-                fit = joined(self._less(model, hypothesis), rival.fit, rival.hypotheses[-1])
-                tried.append(((*others, rival.hypotheses[-1]), fit))
-        fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=ROUGH)
-        chi2 = [fit.chi2 for _, fit in tried]
-        if not chi2 or min(chi2) > model.fit.chi2 - self.enough:
+        robot = self.replays.measured.robot
+        found = [trace.hypothesis for trace in self.found]
+        ways = [*rivalled(model, rounds), *widened(model, rounds, found, robot)]
+        fit_together([way.fit for way in ways], self.replays, self.noise, iterations=ROUGH)
+        if not ways:
             return None
-        best = int(np.argmin(chi2))
-        (better,) = self.models([tried[best]])
+        best = min(ways, key=lambda way: way.fit.chi2)
+        if best.fit.chi2 > model.fit.chi2 - self.enough:
+            return None
+        (better,) = self.models([(best.hypotheses, best.fit)])
         if better.worth > model.worth - self.enough / 2:
             return None
-        chosen_then, hypothesis, others = owners[best]
-        known_as = replace(model, hypotheses=(*others, hypothesis))
-        return replace(chosen_then, finalists=(better, known_as), holding=2)
+        known_as = replace(model, hypotheses=(*best.hypotheses[:-1], *best.given_up))
+        return replace(best.round, finalists=(better, known_as), holding=2)
 
     def model(self, hypotheses: Sequence[Hypothesis], fit: Fit) -> Model:
         """A fitted model with its predictions of the folds."""
@@ -220,7 +146,7 @@ class Selector:
         of, known = self._lesser
         asked_again = of is not None and of.fit is model.fit and of.hypotheses == model.hypotheses
         if not asked_again:
-            known = [self._less(model, h) for h in model.hypotheses]
+            known = [less(model.fit, [h]) for h in model.hypotheses]
             fit_together(known, self.replays, self.noise, iterations=ROUGH)
             self._lesser = model, known
         return known
@@ -348,14 +274,6 @@ class Selector:
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
         seen = self._seen
         return sum(seen.get(h.key, len(h.magnitudes)) + len(h.continuous) for h in hypotheses)
-
-    def _less(self, model: Model, hypothesis: Hypothesis) -> Fit:
-        """A fit of the model without one of its effects."""
-        gone = {*hypothesis.magnitudes, *(name for name, _ in hypothesis.shape)}
-        kept = [i for i, c in enumerate(model.fit.coordinates) if c.name not in gone]
-        coordinates: tuple[Coordinate, ...] = tuple(model.fit.coordinates[i] for i in kept)
-        fixed = {n: v for n, v in model.fit.fixed.items() if n not in gone}
-        return Fit(coordinates, model.fit.at[kept].copy(), fixed=fixed, thorough=False)
 
     def models(self, fitted: Sequence[Tried]) -> list[Model]:
         """Fitted models with what each fold costs them by fits without it."""

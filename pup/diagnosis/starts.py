@@ -107,6 +107,18 @@ def described(nominal: Fit, replays: Replays, noise: Noise) -> Fit | None:
     return fit
 
 
+def less(fit: Fit, gone: Sequence[Hypothesis]) -> Fit:
+    """A fit that is to do without some of its effects."""
+    names = {name for h in gone for name in (*h.magnitudes, *(name for name, _ in h.shape))}
+    kept = [i for i, c in enumerate(fit.coordinates) if c.name not in names]
+    return Fit(
+        tuple(fit.coordinates[i] for i in kept),
+        fit.at[kept].copy(),
+        fixed={n: v for n, v in fit.fixed.items() if n not in names},
+        thorough=False,
+    )
+
+
 def joined(fit: Fit, rival: Fit, own: Hypothesis) -> Fit:
     """A fit with an effect of another one, as that found it."""
     names = {*own.magnitudes, *(name for name, _ in own.shape)}
@@ -115,6 +127,24 @@ def joined(fit: Fit, rival: Fit, own: Hypothesis) -> Fit:
         fit.coordinates + tuple(rival.coordinates[i] for i in kept),
         np.r_[fit.at, rival.at[kept]],
         fixed={**fit.fixed, **{n: v for n, v in rival.fixed.items() if n in names}},
+        thorough=False,
+        slack=ROUGHLY,
+    )
+
+
+def spread(fit: Fit, several: Sequence[Hypothesis], whole: Hypothesis) -> Fit:
+    """A fit with one effect at all places instead of the same at some, as large as those are."""
+    at = dict(zip(fit.names, fit.at, strict=True))
+    free = (*whole.magnitudes, *whole.continuous)
+    coordinates = tuple(term_coordinate(name, whole.scale) for name in free)
+    parts = [(*h.magnitudes, *h.continuous) for h in several]
+    start = np.mean([[at[name] for name in part] for part in parts], axis=0)
+    rest = less(fit, several)
+    fixed = {n: v for n, v in whole.shape if n not in free}
+    return Fit(
+        rest.coordinates + coordinates,
+        np.r_[rest.at, start],
+        fixed={**rest.fixed, **fixed},
         thorough=False,
         slack=ROUGHLY,
     )

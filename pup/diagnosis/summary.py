@@ -14,8 +14,9 @@ from pup.diagnosis.evidence import Projector, Score, Trace, overlap, scores
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.gains import MATERIAL
 from pup.diagnosis.laws import NAMELESS
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.regimes import Window, windows
-from pup.diagnosis.selection import KEPT, Model, Round
+from pup.diagnosis.selection import KEPT
 from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
 from pup.physics.terms import Place
 

@@ -13,9 +13,10 @@ from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.laws import EQUATIONS
 from pup.diagnosis.locate import BAND
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import Model, Round, Selector
+from pup.diagnosis.selection import Selector
 from pup.physics.terms import TERMS, Place, split_column
 
 Array = NDArray[np.float64]

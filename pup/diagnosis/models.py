@@ -1,0 +1,79 @@
+"""Models with effects, as a search for what is missing fits and compares them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.evidence import Score
+from pup.diagnosis.fitting import Fit
+from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.residuals import Measured
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The nominal model with some effects, fitted.
+
+    Attributes:
+      hypotheses: the effects, in the order in which they were found.
+      freedom: of their magnitudes and shapes, how many the data see.
+      fit: of nominal parameters and effects together.
+      held_out: what each fold costs by a fit without it, shape (n_folds,); see `folds.left_out`.
+      measured: the samples that it was fitted to.
+      predicted: what those fits predict, shape (n_samples,), rad; empty where nobody has asked.
+      refits: their coordinates, shape (n_folds, n_free); empty likewise.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    freedom: int
+    fit: Fit
+    held_out: Array
+    measured: Measured
+    predicted: Array = field(default_factory=lambda: np.empty(0))
+    refits: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def samples(self) -> int:
+        """Samples that it was fitted to."""
+        return 0 if self.fit.residual is None else len(self.fit.residual)
+
+    def size(self, hypothesis: Hypothesis) -> float:
+        """Size of the largest magnitude of one of its effects, in what is typical of its kind."""
+        at = dict(zip(self.fit.names, self.fit.at, strict=True))
+        return max(abs(float(at[name])) for name in hypothesis.magnitudes)
+
+    @property
+    def worth(self) -> float:
+        """What it explains: half its chi-squared in sample, half out of it, and its complexity."""
+        inside = self.fit.chi2 + self.freedom * float(np.log(self.samples))
+        return (inside + float(self.held_out.sum())) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One effect's choice.
+
+    Attributes:
+      before: the model it was added to.
+      ranking: what the score test said, best first.
+      finalists: the models refitted, best first: those that hold, then the others.
+      holding: how many of them hold; with any, the first was added.
+    """
+
+    before: Model
+    ranking: tuple[Score, ...]
+    finalists: tuple[Model, ...]
+    holding: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether an effect was added."""
+        return self.holding > 0
+
+    @property
+    def chosen(self) -> Hypothesis:
+        """The effect that was found best."""
+        return self.finalists[0].hypotheses[-1]
