@@ -1,5 +1,6 @@
 """Fixtures that several test files use."""
 
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -15,6 +16,9 @@ from pup.sysid.virtual import record
 
 settings.register_profile("patient", deadline=None)  # a machine that is busy is no fault
 settings.load_profile("patient")
+
+# A shell that runs the tests in the background has them, and all that they start, ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(__file__).parents[2] / "shared"
 

@@ -59,6 +59,7 @@ def test_a_concealed_effect_is_named_and_measured(
     assert told.held_out.after == pytest.approx(0.00205, rel=0.1)  # the noise, quantised
 
 
+@pytest.mark.slow
 def test_what_a_large_effect_hides_is_found_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each round looks around its own model: what else is missing does other things there.
 
