@@ -52,6 +52,8 @@ def wanted(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("undisturbed")
     done = pup("diagnose", runs, "--robot", "servo_bench", "--local", "--cores", 1, "--out", out)
     assert done.code == 0, done.err
+    lines = done.err.splitlines()
+    assert any(x.startswith("refits, ") and " at joint:servo found: 5" in x for x in lines)
     return out
 
 

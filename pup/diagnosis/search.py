@@ -31,6 +31,8 @@ ASTRAY, FAR = 0.5, 0.2
 """A motion is lost where a joint is off by this share of what it moves, and by so much, rad."""
 LEFT = 1 / 3
 """Share of all recordings that must be left for a first look."""
+HALFWAY = 3
+"""So many effects found are half of what refits do, as far as anybody can know."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,15 @@ def search(
     if not found:
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
-    selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base, most)
+
+    def told(model: Model) -> None:
+        newest, number = model.hypotheses[-1], len(model.hypotheses)
+        progress(
+            f"refits, {newest.effect} at {newest.place} found",
+            0.5 + 0.3 * number / (number + HALFWAY),
+        )
+
+    selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base, most, told)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
     start = selector.nominal

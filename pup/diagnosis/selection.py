@@ -5,7 +5,7 @@ parameters is not. Effects are added one by one, the best first, as long as they
 by more than chance and predict types of motion that were left out; then each is tried without.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +67,7 @@ class Selector:
       nominal: the nominal fit, with its Jacobian.
       base: the fit to start from, where some effects are known already.
       most: effects that are looked for.
+      told: of each effect that is added.
     """
 
     def __init__(
@@ -78,11 +79,12 @@ class Selector:
         nominal: Fit,
         base: Fit | None = None,
         most: int = 8,
+        told: Callable[[Model], None] = lambda model: None,
     ) -> None:
         self.replays = replays
         self.noise = noise
         self.found, self.base = tuple(found), base or nominal
-        self.enough, self.most = enough, most
+        self.enough, self.most, self.told = enough, most, told
         self.folds = folds(replays)
         self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
         self._lesser: tuple[Model | None, list[Fit]] = None, []
@@ -115,6 +117,7 @@ class Selector:
             if not chosen.accepted:
                 break
             model = chosen.finalists[0]
+            self.told(model)
         return model
 
     def _swap(self, model: Model, rounds: Sequence[Round]) -> Round | None:
