@@ -19,7 +19,7 @@ from pup.diagnosis.experiment import (
 from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
-from pup.diagnosis.models import Model, Round
+from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.noise import assumed_noise, quiet_noise
 from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
@@ -278,7 +278,7 @@ def _next(
     for finding in found:
         if finding.equivalents:
             key = finding.effect, finding.place
-            chosen = next(r for r in rounds if r.accepted and r.chosen.key == key)
+            chosen = chosen_in(rounds, key)
             rivals = rivals_of(finding, chosen, selector)
             return next_recording(selector.replays.measured.robot, rivals, selector.noise, factory)
     return None

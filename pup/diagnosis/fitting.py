@@ -182,8 +182,7 @@ def _differences(fit: Fit, at: Array) -> tuple[Array, list[dict[str, float]]]:
 
 
 def _jacobian(steps: Array, changed: Array, replays: Replays, noise: Noise) -> Array:
-    lost = np.isnan(changed).any(axis=1, keepdims=True)
-    white = replays.measured.whiten(np.where(lost, 0.0, changed), noise)
+    white = replays.measured.whiten(np.where(np.isnan(changed), 0.0, changed), noise)
     return np.asarray((white / steps[:, None]).T)
 
 

@@ -1,5 +1,6 @@
 """Models with effects, as a search for what is missing fits and compares them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +10,7 @@ from pup.diagnosis.evidence import Score
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.residuals import Measured
+from pup.physics.terms import Place
 
 Array = NDArray[np.float64]
 
@@ -77,3 +79,8 @@ class Round:
     def chosen(self) -> Hypothesis:
         """The effect that was found best."""
         return self.finalists[0].hypotheses[-1]
+
+
+def chosen_in(rounds: Sequence[Round], key: tuple[str, Place]) -> Round:
+    """The last of the rounds that chose an effect: by then more of the others was known."""
+    return next(r for r in reversed(rounds) if r.accepted and r.chosen.key == key)

@@ -26,6 +26,8 @@ BATCH = 384
 """Simulations in a batch, at most."""
 WORTH = 8
 """Simulations that are worth a batch of their own."""
+WIDEST_FIRST = {"group": 1, "joint": 2}
+"""Order of kinds of places; all others come first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +231,9 @@ def union(space: ParameterSpace, rows: Sequence[Row]) -> ParameterSpace:
             told = split_column(name)
             if told is not None and name not in space.names:
                 extra[told[0], told[2]] = None
-    spaces = [space, *(term_space(effect, place) for effect, place in extra)]
+    # Where places overlap, the shape of the narrower counts, whatever else is in the batch.
+    ordered = sorted(extra, key=lambda term: WIDEST_FIRST.get(term[1].kind, 0))
+    spaces = [space, *(term_space(effect, place) for effect, place in ordered)]
     return ParameterSpace(
         sum((s.names for s in spaces), ()),
         sum((s.units for s in spaces), ()),

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
-from pup.diagnosis.exchanges import rivalled, widened
 from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
@@ -22,10 +21,11 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.shortlist import shortlist
 from pup.diagnosis.starts import (
-    CLOSELY,
     Tried,
+    closely,
     described,
     distinct,
+    joined,
     less,
     options,
     puzzling,
@@ -33,11 +33,12 @@ from pup.diagnosis.starts import (
     without_samples,
 )
 from pup.diagnosis.tracing import traces
+from pup.physics.terms import Place
 
 Array = NDArray[np.float64]
 
-FIRST, ROUGH, LAST = 2, 5, 14
-"""Steps of all finalists until they are compared, of those promising then, and of the best."""
+FIRST, ROUGH = 2, 5
+"""Steps of all finalists until they are compared, and of those promising then."""
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
@@ -45,8 +46,8 @@ CLOSE, MARGIN = 4, 40.0
 LEADING = 400
 """Hypotheses that are simulated again around a model that has an effect more: where there are more,
 those that looked most like its errors before."""
-SWAPS = 2
-"""Effects that may be exchanged."""
+SWAPS, RIVALS = 2, 2
+"""Effects that may be exchanged, and rivals that each may be exchanged for."""
 PLACES = 16
 """Places that all effects together may act at."""
 KEPT = 0.25
@@ -98,9 +99,9 @@ class Selector:
         """
         model = start
         rounds: list[Round] = []
-        for _ in range(SWAPS + 1):
+        for left in reversed(range(SWAPS + 1)):
             model = self._added(model, rounds)
-            swap = self._swap(model, rounds)
+            swap = self._swap(model, rounds) if left else None
             if swap is None:
                 break
             rounds.append(swap)
@@ -121,24 +122,54 @@ class Selector:
         return model
 
     def _swap(self, model: Model, rounds: Sequence[Round]) -> Round | None:
-        """An effect exchanged for a rival of its own round, or several for one at all their places.
+        """An effect exchanged for a rival of its own round, where what came later prefers that.
 
         The first effects are chosen while others still hide; the last knows all of them.
         """
-        robot = self.replays.measured.robot
-        found = [trace.hypothesis for trace in self.found]
-        ways = [*rivalled(model, rounds), *widened(model, rounds, found, robot)]
-        fit_together([way.fit for way in ways], self.replays, self.noise, iterations=ROUGH)
-        if not ways:
+        ways = self._exchanges(model, rounds)
+        tried = [one for _, one in ways]
+        fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=ROUGH)
+        chi2 = [fit.chi2 for _, fit in tried]
+        if not chi2 or min(chi2) > model.fit.chi2 - self.enough:
             return None
-        best = min(ways, key=lambda way: way.fit.chi2)
-        if best.fit.chi2 > model.fit.chi2 - self.enough:
-            return None
-        (better,) = self.models([(best.hypotheses, best.fit)])
+        number = ways[int(np.argmin(chi2))][0]
+        same = sorted(self.models([one for n, one in ways if n == number]), key=lambda m: m.worth)
+        better = self._ended(same[0])
         if better.worth > model.worth - self.enough / 2:
             return None
-        known_as = replace(model, hypotheses=(*best.hypotheses[:-1], *best.given_up))
-        return replace(best.round, finalists=(better, known_as), holding=2)
+        given_up = model.hypotheses[number]
+        others = tuple(h for h in model.hypotheses if h is not given_up)
+        known_as = replace(model, hypotheses=(*others, given_up))
+        rest = sorted([*same[1:], known_as], key=lambda m: m.worth)
+        before = self.model(others, self.without(model)[number])
+        ranking = self._round_of(given_up, rounds)[0].ranking
+        return Round(before, ranking, (better, *rest), 1 + len(rest))
+
+    def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
+        """Models with a rival in place of an effect, and which of them that is."""
+        known = {h.key for h in model.hypotheses}
+        ways: list[tuple[int, Tried]] = []
+        for number, hypothesis in enumerate(model.hypotheses[:-1]):
+            others = tuple(h for h in model.hypotheses if h is not hypothesis)
+            for chosen in self._round_of(hypothesis, rounds):
+                rivals = [m for m in chosen.finalists[1:] if m.hypotheses[-1].key not in known]
+                for rival in rivals[:RIVALS]:
+                    new = rival.hypotheses[-1]
+                    fit = joined(less(model.fit, hypothesis), rival.fit, new)
+                    ways.append((number, ((*others, new), fit)))
+        return ways
+
+    @staticmethod
+    def _round_of(hypothesis: Hypothesis, rounds: Sequence[Round]) -> list[Round]:
+        """The last round that chose an effect; none where it was known from the start."""
+        return [r for r in rounds if r.accepted and r.chosen.key == hypothesis.key][-1:]
+
+    def _ended(self, model: Model) -> Model:
+        """A model with its fit at its minimum, for later ones are held against it."""
+        if model.fit.thorough:
+            return model
+        closely([model.fit], self.replays, self.noise)
+        return self.model(model.hypotheses, model.fit)
 
     def model(self, hypotheses: Sequence[Hypothesis], fit: Fit) -> Model:
         """A fitted model with its predictions of the folds."""
@@ -149,7 +180,7 @@ class Selector:
         of, known = self._lesser
         asked_again = of is not None and of.fit is model.fit and of.hypotheses == model.hypotheses
         if not asked_again:
-            known = [less(model.fit, [h]) for h in model.hypotheses]
+            known = [less(model.fit, h) for h in model.hypotheses]
             fit_together(known, self.replays, self.noise, iterations=ROUGH)
             self._lesser = model, known
         return known
@@ -162,7 +193,9 @@ class Selector:
         tried = self._begun(model, ranking)
         self._refit(tried, fit.chi2)
         if not model.hypotheses and puzzling(fit, tried):
-            elsewhere = self._elsewhere()
+            more, elsewhere = self._elsewhere()
+            ranked = {score.trace.hypothesis for score in ranking}
+            ranking += [score for score in more if score.trace.hypothesis not in ranked]
             self._refit(elsewhere, fit.chi2)
             tried = distinct([*tried, *elsewhere])
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
@@ -170,6 +203,8 @@ class Selector:
             return Round(model, tuple(ranking), (), 0)
         finalists = sorted(self.models(better), key=lambda m: m.worth)
         holds = [m for m in finalists if self._holds(model, m)]
+        if holds:
+            holds[0] = self._ended(holds[0])
         others = [m for m in finalists if m not in holds]
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
@@ -184,14 +219,14 @@ class Selector:
         start_best([f for _, f in tried], places, self.replays, self.noise)
         return tried
 
-    def _elsewhere(self) -> list[Tried]:
-        """Fits with one effect that begin at the robot as it is described; see `described`."""
+    def _elsewhere(self) -> tuple[list[Score], list[Tried]]:
+        """Scores, and fits that begin, at the robot as it is described; see `described`."""
         fit = described(self.nominal.fit, self.replays, self.noise)
         if fit is None:
-            return []
+            return [], []
         found = traces(hypotheses(self.replays.measured), fit, self.replays, self.noise)
         ranking = scores(found, _unimitated(fit))
-        return self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
+        return ranking, self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
 
     def _traces(self, model: Model) -> list[Trace]:
         """Traces of what a model does not have, around it: a large effect changes all others'."""
@@ -211,9 +246,12 @@ class Selector:
         old = [t for t in self.found if t.hypothesis.key in kept]
         again = [traced(t.hypothesis, t.whole, project) for t in old]
         ranking = scores([t for t in again if t is not None], project(fit.residual[:, None])[:, 0])
-        place = {s.trace.hypothesis.key: rank for rank, s in enumerate(ranking)}
-        leading = sorted(rest, key=lambda h: place.get(h.key, len(place)))[:LEADING]
-        left = {h.key for h in leading}
+        place: dict[tuple[str, Place], int] = {}
+        for rank, score in enumerate(ranking):  # by the best of its forms
+            place.setdefault(score.trace.hypothesis.key, rank)
+        ordered = sorted(rest, key=lambda h: place.get(h.key, len(ranking)))
+        left = {h.key for h in ordered[:LEADING]}
+        leading = [h for h in ordered if h.key in left]
         new = traces(leading, fit, self.replays, self.noise)
         return (*new, *(s.trace for s in ranking if s.trace.hypothesis.key not in left))
 
@@ -244,9 +282,7 @@ class Selector:
             or fit is fits[0]
             or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
         ]
-        for fit in close:
-            fit.thorough, fit.done, fit.jacobian, fit.slack = True, False, None, CLOSELY
-        fit_together(close, self.replays, self.noise, iterations=LAST)
+        closely(close, self.replays, self.noise)
 
     def _holds(self, before: Model, after: Model) -> bool:
         """Whether an effect keeps its gain where it was not fitted, and matters."""
@@ -271,7 +307,7 @@ class Selector:
             if costs[spare] > self.enough:
                 return model
             left = [h for i, h in enumerate(model.hypotheses) if i != spare]
-            model = self.model(left, fits[spare])
+            model = self._ended(self.model(left, fits[spare]))
         return model
 
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:

@@ -19,6 +19,8 @@ Tried = tuple[tuple[Hypothesis, ...], Fit]
 ROUGHLY, CLOSELY = 1e-3, 1e-4
 """Relative gain of chi-squared at which a finalist's fit may end: at first, and to be compared with
 others, which differ by less than what a step in a narrow valley gains."""
+LAST = 14
+"""Steps of a finalist's fit to its end."""
 SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
 DAMPED, FURTHEST = 0.01, 0.5
@@ -107,14 +109,14 @@ def described(nominal: Fit, replays: Replays, noise: Noise) -> Fit | None:
     return fit
 
 
-def less(fit: Fit, gone: Sequence[Hypothesis]) -> Fit:
-    """A fit that is to do without some of its effects."""
-    names = {name for h in gone for name in (*h.magnitudes, *(name for name, _ in h.shape))}
-    kept = [i for i, c in enumerate(fit.coordinates) if c.name not in names]
+def less(fit: Fit, hypothesis: Hypothesis) -> Fit:
+    """A fit that is to do without one of its effects."""
+    gone = {*hypothesis.magnitudes, *(name for name, _ in hypothesis.shape)}
+    kept = [i for i, c in enumerate(fit.coordinates) if c.name not in gone]
     return Fit(
         tuple(fit.coordinates[i] for i in kept),
         fit.at[kept].copy(),
-        fixed={n: v for n, v in fit.fixed.items() if n not in names},
+        fixed={n: v for n, v in fit.fixed.items() if n not in gone},
         thorough=False,
     )
 
@@ -127,24 +129,6 @@ def joined(fit: Fit, rival: Fit, own: Hypothesis) -> Fit:
         fit.coordinates + tuple(rival.coordinates[i] for i in kept),
         np.r_[fit.at, rival.at[kept]],
         fixed={**fit.fixed, **{n: v for n, v in rival.fixed.items() if n in names}},
-        thorough=False,
-        slack=ROUGHLY,
-    )
-
-
-def spread(fit: Fit, several: Sequence[Hypothesis], whole: Hypothesis) -> Fit:
-    """A fit with one effect at all places instead of the same at some, as large as those are."""
-    at = dict(zip(fit.names, fit.at, strict=True))
-    free = (*whole.magnitudes, *whole.continuous)
-    coordinates = tuple(term_coordinate(name, whole.scale) for name in free)
-    parts = [(*h.magnitudes, *h.continuous) for h in several]
-    start = np.mean([[at[name] for name in part] for part in parts], axis=0)
-    rest = less(fit, several)
-    fixed = {n: v for n, v in whole.shape if n not in free}
-    return Fit(
-        rest.coordinates + coordinates,
-        np.r_[rest.at, start],
-        fixed={**rest.fixed, **fixed},
         thorough=False,
         slack=ROUGHLY,
     )
@@ -164,5 +148,12 @@ def without_samples(fit: Fit, inside: NDArray[np.bool_]) -> Fit:
         chi2=float((fit.residual * weight) @ fit.residual),
         thorough=False,
         age=1,
-        slack=ROUGHLY,
     )
+
+
+def closely(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Bring fits to their ends, with Jacobians of their own, to be compared with others."""
+    for fit in fits:
+        fit.thorough, fit.done, fit.jacobian, fit.slack = True, False, None, CLOSELY
+        fit.damping, fit.stuck = Fit.damping, 0
+    fit_together(fits, replays, noise, iterations=LAST)

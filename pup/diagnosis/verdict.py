@@ -13,7 +13,7 @@ from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.laws import EQUATIONS
 from pup.diagnosis.locate import BAND
-from pup.diagnosis.models import Model, Round
+from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector
@@ -175,7 +175,7 @@ def findings(
         assert less.residual is not None and final.fit.residual is not None
         squares = less.residual**2 - final.fit.residual**2
         gain = less.chi2 - final.fit.chi2
-        chosen = next(r for r in rounds if r.accepted and r.chosen.key == hypothesis.key)
+        chosen = chosen_in(rounds, hypothesis.key)
         # What is hardly more than chance counts little, and so comes after what explains much.
         known = 1 - doubt(gain, left + selector.enough)
         probability, rivals = _rivals(hypothesis, chosen, selector, known)
