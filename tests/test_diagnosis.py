@@ -12,7 +12,7 @@ from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.engine import Diagnosis, diagnose
 from pup.diagnosis.evidence import Projector, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Fit, fit_together
-from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.noise import noise_floor, quanta, quiet_noise
 from pup.diagnosis.replays import Batch, Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise, steady_start
@@ -233,6 +233,39 @@ def test_the_threshold_is_reached_by_chance_as_often_as_it_says() -> None:
         draw = project(rng.normal(size=(len(measured.values), 1)))[:, 0]
         exceeded += scores(told, draw)[0].surprise > enough
     assert 4 <= exceeded <= 32
+
+
+def test_an_effect_is_simulated_again_for_its_best_form_in_all_its_forms(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of ripples of fourteen numbers of teeth few look like the errors, and most like nothing."""
+    measured = Measured.of(BENCH, recordings({f"cogging/sine@{SERVO}": 0.02}))
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    noise = Noise(np.full(3, 0.002), np.zeros(3), "assumed")
+    free = tuple(
+        Coordinate(n, None, np.log(v) - 1, np.log(v) + 1)
+        for n, v in zip(replays.space.names, replays.space.nominal, strict=True)
+    )
+    fit = Fit(free, np.log(replays.space.nominal))
+    fit_together([fit], replays, noise, iterations=8)
+    tried = ("cogging", "backlash", "joint_spring", "encoder_eccentricity")
+    known = [h for h in hypotheses(measured) if h.effect in tried]
+    found = traces(known, fit, replays, noise)
+    monkeypatch.setattr(selection, "LEADING", 1)
+    selector = selection.Selector(replays, noise, found, 15.0, fit)
+    monkeypatch.setattr(selection, "traces", lambda leading, *more: asked.extend(leading) or [])
+    asked: list[Hypothesis] = []
+    kept = selector._traced_anew(fit, known)
+    assert fit.jacobian is not None and fit.residual is not None
+    project = Projector(fit.jacobian)
+    ranking = scores(found, project(fit.residual[:, None])[:, 0])
+    assert ranking[0].trace.hypothesis.effect == "cogging"
+    last = {score.trace.hypothesis.effect: rank for rank, score in enumerate(ranking)}
+    assert min(last, key=lambda effect: last[effect]) != "cogging", (
+        "its worst form is among the last"
+    )
+    assert asked == [h for h in known if h.effect == "cogging"]
+    assert {t.hypothesis.effect for t in kept} == set(tried) - {"cogging"}
 
 
 def test_what_was_replayed_is_not_replayed_again(tmp_path: Path) -> None:

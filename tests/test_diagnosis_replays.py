@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pup.diagnosis.replays import Batch, Bench, Replays, threads
-from pup.diagnosis.residuals import Measured
+from pup.diagnosis.fitting import _jacobian
+from pup.diagnosis.replays import Batch, Bench, Replays, threads, union
+from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.store import Store
 from pup.physics.parameters import robot_space
 from pup.physics.push import Push
+from pup.physics.terms import Place, column
 from pup.recording_cuts import beginning
 from tests.diagnosis_cases import BENCH, recordings
 
@@ -67,3 +69,24 @@ def test_what_was_kept_is_read_again_and_nothing_else(measured: Measured, tmp_pa
     assert len(asked) == 2
     short = Replays(measured, robot_space(BENCH, "pd"), Store(tmp_path, "it").around(counted), 1)
     assert short.shortened(1.0)(ROWS[:1]).shape[1] < short(ROWS[:1]).shape[1]
+
+
+def test_where_places_overlap_the_shape_of_the_narrower_counts(measured: Measured) -> None:
+    """Whichever rows come first in a batch."""
+    robot, joint = Place("robot"), Place("joint", "servo")
+    narrow = {column("stribeck_friction", "speed", joint): 2.0}
+    wide = {column("stribeck_friction", "speed", robot): 0.1}
+    space = robot_space(BENCH, "pd")
+    for rows in ([narrow, wide], [wide, narrow]):
+        names = union(space, rows).names
+        assert names.index(next(iter(wide))) < names.index(next(iter(narrow)))
+
+
+def test_samples_that_are_lost_say_nothing_and_others_do(measured: Measured) -> None:
+    """A simulation that breaks down in one recording is still told apart by the rest."""
+    noise = Noise(np.full(measured.channels, 0.002), np.zeros(measured.channels), "assumed")
+    changed = np.ones((1, len(measured.values)))
+    changed[0, measured.only([0])] = np.nan
+    jacobian = _jacobian(np.array([0.5]), changed, bench(measured), noise)
+    assert not jacobian[measured.only([0])].any()
+    assert (jacobian[~measured.only([0])] == 2.0 / 0.002).all()
