@@ -16,7 +16,8 @@ def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
 
     Forms that no refit leads from one to the other are all looked at, and so are effects of the
     best one's class where it acts: a nominal fit may have made up for one of them to first order,
-    as damping does for a lag, so that its slope says nothing.
+    as damping does for a lag, so that its slope says nothing. What one group shows, all servos may
+    have: it is looked at everywhere too.
     """
     least = max(enough, WORTH * ranking[0].surprise)
     best: dict[tuple[tuple[str, Place], tuple[float, ...]], Score] = {}
@@ -26,10 +27,12 @@ def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
         room = hypothesis.key in known or len(known) < FINALISTS
         if score.surprise >= least and room:
             best.setdefault((hypothesis.key, hypothesis.choices), score)
+    shared = {effect for (effect, place), _ in best if place.kind == "group"}
     first = ranking[0].trace.hypothesis
     for score in ranking:
         other = score.trace.hypothesis
-        whole = {other.place.kind, first.place.kind} == {"robot", "bus"}
-        if other.family == first.family and (whole or other.place == first.place):
+        everywhere = other.place.kind in ("robot", "bus")
+        same = other.place == first.place or (everywhere and first.place.kind in ("robot", "bus"))
+        if (other.family == first.family and same) or (everywhere and other.effect in shared):
             best.setdefault((other.key, other.choices), score)
     return list(best.values())

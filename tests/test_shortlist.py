@@ -1,0 +1,53 @@
+"""Which effects are refitted: of each the best form, and everywhere what a group shows."""
+
+import numpy as np
+
+from pup.diagnosis.evidence import Score, Trace
+from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.shortlist import FINALISTS, shortlist
+from pup.physics.terms import Place
+from pup.physics.terms.scale import Scale
+from pup.robot import RobotDescription
+
+SCALE = Scale.of(RobotDescription.load("darwin_leg"))
+ONE = np.ones((1, 1))
+ALL, ANKLE, KNEE = Place("robot"), Place("group", "ankle"), Place("joint", "l_knee")
+
+
+def score(effect: str, place: Place, surprise: float) -> Score:
+    trace = Trace(Hypothesis(effect, place, SCALE), ONE, ONE, ONE)
+    return Score(trace, surprise, 1, np.ones(1))
+
+
+def chosen(*ranking: Score) -> list[tuple[str, Place]]:
+    return [s.trace.hypothesis.key for s in shortlist(ranking, enough=15.0)]
+
+
+def test_what_a_group_shows_is_looked_at_everywhere() -> None:
+    """Its slope at all joints may promise nothing, as other joints hide it in their gains."""
+    first = score("cogging", KNEE, 500.0)
+    group = score("derivative_kick", ANKLE, 300.0)
+    everywhere = score("derivative_kick", ALL, 2.0)
+    other = score("coulomb_friction", ALL, 2.0)
+    found = [("cogging", KNEE), ("derivative_kick", ANKLE)]
+    assert chosen(first, group, everywhere, other) == [*found, ("derivative_kick", ALL)]
+
+
+def test_what_a_joint_shows_is_not() -> None:
+    first, joint = score("cogging", KNEE, 500.0), score("derivative_kick", KNEE, 300.0)
+    everywhere = score("derivative_kick", ALL, 2.0)
+    assert ("derivative_kick", ALL) not in chosen(first, joint, everywhere)
+
+
+def test_what_promises_little_beside_the_best_is_left() -> None:
+    joints = [Place("joint", f"j{i}") for i in range(20)]
+    many = [score("cogging", place, 500.0 - i) for i, place in enumerate(joints)]
+    assert len(chosen(*many)) == FINALISTS
+    assert chosen(many[0], score("backlash", KNEE, 49.0)) == [many[0].trace.hypothesis.key]
+
+
+def test_the_class_of_the_best_is_looked_at_where_that_acts() -> None:
+    rival = score("quadratic_damping", ANKLE, 1.0)
+    assert chosen(score("torque_speed_limit", ANKLE, 90.0), rival)[1:] == [
+        rival.trace.hypothesis.key
+    ]
