@@ -212,17 +212,22 @@ def test_fits_stay_in_their_boxes_and_find_the_corner() -> None:
     assert np.linalg.norm(replays.matrix[:, 0] * missed) ** 2 < ENOUGH
 
 
+def as_described(replays: Replays) -> Fit:
+    """The robot as it is described, free to move by a factor of e."""
+    free = tuple(
+        Coordinate(n, None, np.log(v) - 1, np.log(v) + 1)
+        for n, v in zip(replays.space.names, replays.space.nominal, strict=True)
+    )
+    return Fit(free, np.log(replays.space.nominal))
+
+
 def test_the_threshold_is_reached_by_chance_as_often_as_it_says() -> None:
     """Pure noise, projected as errors are, exceeds it in one case of twenty."""
     measured = Measured.of(BENCH, recordings({}))
     replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
     rng = np.random.default_rng(2)
     noise = Noise(np.full(3, 0.002), np.zeros(3), "assumed")
-    free = tuple(
-        Coordinate(n, None, np.log(v) - 1, np.log(v) + 1)
-        for n, v in zip(replays.space.names, replays.space.nominal, strict=True)
-    )
-    fit = Fit(free, np.log(replays.space.nominal))
+    fit = as_described(replays)
     fit_together([fit], replays, noise, iterations=1)
     told = traces(hypotheses(measured), fit, replays, noise)
     enough = threshold(told, rng, 0.05)
@@ -242,11 +247,7 @@ def test_an_effect_is_simulated_again_for_its_best_form_in_all_its_forms(
     measured = Measured.of(BENCH, recordings({f"cogging/sine@{SERVO}": 0.02}))
     replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
     noise = Noise(np.full(3, 0.002), np.zeros(3), "assumed")
-    free = tuple(
-        Coordinate(n, None, np.log(v) - 1, np.log(v) + 1)
-        for n, v in zip(replays.space.names, replays.space.nominal, strict=True)
-    )
-    fit = Fit(free, np.log(replays.space.nominal))
+    fit = as_described(replays)
     fit_together([fit], replays, noise, iterations=8)
     tried = ("cogging", "backlash", "joint_spring", "encoder_eccentricity")
     known = [h for h in hypotheses(measured) if h.effect in tried]
