@@ -37,7 +37,7 @@ def explains(newest: Hypothesis, before: Fit, after: Fit, measured: Measured, kn
       measured: the samples.
       known: whether it has been found at another place.
     """
-    own = joints_at(newest.place, measured.robot)
+    own = _joints(newest.place, measured.robot)
     then, now = (_excess(fit, measured.channel, len(own))[own] for fit in (before, after))
     gain = then - now
     shown = gain >= SHOWN * gain.max()
@@ -68,7 +68,7 @@ def _excess(fit: Fit, channel: NDArray[np.int64], channels: int) -> Array:
     return np.asarray(np.bincount(channel, fit.residual**2 - 1, minlength=channels), dtype=float)
 
 
-def joints_at(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
+def _joints(place: Place, robot: RobotDescription) -> NDArray[np.bool_]:
     """The channels of the joints at a place; all channels where it is none of some joints."""
     chosen = np.zeros(len(robot.joints) + 2, dtype=bool)
     joints = place.joints(robot)

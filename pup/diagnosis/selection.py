@@ -16,7 +16,7 @@ from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
-from pup.diagnosis.models import Model, Round
+from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.shortlist import shortlist
@@ -142,27 +142,25 @@ class Selector:
         known_as = replace(model, hypotheses=(*others, given_up))
         rest = sorted([*same[1:], known_as], key=lambda m: m.worth)
         before = self.model(others, self.without(model)[number])
-        ranking = self._round_of(given_up, rounds)[0].ranking
+        ranking = chosen_in(rounds, given_up.key).ranking
         return Round(before, ranking, (better, *rest), 1 + len(rest))
 
     def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
         """Models with a rival in place of an effect, and which of them that is."""
         known = {h.key for h in model.hypotheses}
+        last = {r.chosen.key: r for r in rounds if r.accepted}
         ways: list[tuple[int, Tried]] = []
         for number, hypothesis in enumerate(model.hypotheses[:-1]):
             others = tuple(h for h in model.hypotheses if h is not hypothesis)
-            for chosen in self._round_of(hypothesis, rounds):
-                rivals = [m for m in chosen.finalists[1:] if m.hypotheses[-1].key not in known]
-                for rival in rivals[:RIVALS]:
-                    new = rival.hypotheses[-1]
-                    fit = joined(less(model.fit, hypothesis), rival.fit, new)
-                    ways.append((number, ((*others, new), fit)))
+            if hypothesis.key not in last:  # it was known from the start
+                continue
+            finalists = last[hypothesis.key].finalists[1:]
+            rivals = [m for m in finalists if m.hypotheses[-1].key not in known]
+            for rival in rivals[:RIVALS]:
+                new = rival.hypotheses[-1]
+                fit = joined(less(model.fit, hypothesis), rival.fit, new)
+                ways.append((number, ((*others, new), fit)))
         return ways
-
-    @staticmethod
-    def _round_of(hypothesis: Hypothesis, rounds: Sequence[Round]) -> list[Round]:
-        """The last round that chose an effect; none where it was known from the start."""
-        return [r for r in rounds if r.accepted and r.chosen.key == hypothesis.key][-1:]
 
     def _ended(self, model: Model) -> Model:
         """A model with its fit at its minimum, for later ones are held against it."""

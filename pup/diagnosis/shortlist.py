@@ -9,6 +9,8 @@ FINALISTS = 8
 """Hypotheses refitted in each round, beside those of the best one's class."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
+EVERYWHERE = ("robot", "bus")
+"""Kinds of places that all servos are at."""
 
 
 def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
@@ -31,8 +33,8 @@ def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
     first = ranking[0].trace.hypothesis
     for score in ranking:
         other = score.trace.hypothesis
-        everywhere = other.place.kind in ("robot", "bus")
-        same = other.place == first.place or (everywhere and first.place.kind in ("robot", "bus"))
+        everywhere = other.place.kind in EVERYWHERE
+        same = other.place == first.place or (everywhere and first.place.kind in EVERYWHERE)
         if (other.family == first.family and same) or (everywhere and other.effect in shared):
             best.setdefault((other.key, other.choices), score)
     return list(best.values())
