@@ -83,7 +83,7 @@ class Projector:
         lengths = np.linalg.norm(jacobian, axis=0)
         scaled = jacobian / np.maximum(lengths, 1e-12)
         left, spread, _ = np.linalg.svd(scaled, full_matrices=False)
-        self.basis = left[:, spread > 1e-4 * spread.max()]
+        self.basis = left[:, spread > 1e-4 * spread.max(initial=0.0)]
 
     def __call__(self, columns: Array) -> Array:
         """What is left of columns (n_samples, n)."""

@@ -94,6 +94,24 @@ class Fit:
         """All parameters that are not nominal."""
         return self.row()
 
+    @property
+    def slopes(self) -> Array:
+        """The Jacobian's columns of what can move, shape (n_samples, n_movable).
+
+        A coordinate that the data press against an end of its range stays there, and imitates
+        nothing of what they ask for beyond it.
+        """
+        assert self.jacobian is not None
+        return self.jacobian[:, self.movable]
+
+    @property
+    def movable(self) -> NDArray[np.bool_]:
+        """Whether each coordinate can go where chi-squared is lower, shape (n_free,)."""
+        _, downhill = _normal(self)
+        above = self.at > np.array([c.upper for c in self.coordinates]) - ALMOST
+        below = self.at < np.array([c.lower for c in self.coordinates]) + ALMOST
+        return ~(above & (downhill > 0) | below & (downhill < 0))
+
     def covariance(self) -> Array:
         """Of the coordinates, shape (n_free, n_free); what the data do not see has its range."""
         assert self.jacobian is not None

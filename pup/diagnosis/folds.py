@@ -26,11 +26,12 @@ def left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:
     how well the other samples tell where they should lie. What one type of motion alone can tell is
     then not held against a model, but its freedom is.
     """
-    assert fit.jacobian is not None and fit.residual is not None
-    jacobian, residual = fit.jacobian, fit.residual
+    assert fit.residual is not None
+    jacobian, residual = fit.slopes, fit.residual
     # What a model leaves counts as noise, else a wrong form would be sure of its parameters.
     noise = max(1.0, fit.chi2 / len(residual))
-    reach = np.array([NOMINAL if c.scale is None else TYPICAL for c in fit.coordinates])
+    scales = [c.scale for c in fit.coordinates]
+    reach = np.array([NOMINAL if scale is None else TYPICAL for scale in scales])[fit.movable]
     prior, outside = np.diag(1 / reach**2), jacobian[~inside]
     normal = outside.T @ outside / noise + prior
     step = np.linalg.solve(normal, outside.T @ residual[~inside] / noise)

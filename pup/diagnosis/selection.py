@@ -238,8 +238,8 @@ class Selector:
 
     def _traced_anew(self, fit: Fit, rest: Sequence[Hypothesis]) -> tuple[Trace, ...]:
         """Traces around a fit; where there are very many, those of the hopeless as they were."""
-        assert fit.jacobian is not None and fit.residual is not None
-        project = Projector(fit.jacobian)
+        assert fit.residual is not None
+        project = Projector(fit.slopes)
         kept = {h.key for h in rest}
         old = [t for t in self.found if t.hypothesis.key in kept]
         again = [traced(t.hypothesis, t.whole, project) for t in old]
@@ -349,5 +349,5 @@ def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
 
 def _unimitated(fit: Fit) -> Array:
     """What a fit leaves that none of its own coordinates can imitate, shape (n_samples,)."""
-    assert fit.jacobian is not None and fit.residual is not None
-    return Projector(fit.jacobian)(fit.residual[:, None])[:, 0]
+    assert fit.residual is not None
+    return Projector(fit.slopes)(fit.residual[:, None])[:, 0]

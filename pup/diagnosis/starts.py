@@ -60,18 +60,20 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
 
     Many an effect acts from some size on, and then more than its slope says.
     """
-    assert before.jacobian is not None and before.residual is not None
+    assert before.residual is not None
     n, trace = len(before.at), score.trace.whole
     sizes = fit.at[n : n + trace.shape[1]]
-    normal = before.jacobian.T @ before.jacobian
-    normal[np.diag_indices(n)] += 1 + DAMPED * np.diag(normal)
+    slopes = before.slopes
+    normal = slopes.T @ slopes
+    normal[np.diag_indices_from(normal)] += 1 + DAMPED * np.diag(normal)
     low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
     places = []
     for share in SHARES:
         at = fit.at.copy()
         at[n : n + len(sizes)] = share * sizes
-        left = before.jacobian.T @ (before.residual - trace @ (share * sizes))
-        step = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
+        left = slopes.T @ (before.residual - trace @ (share * sizes))
+        step = np.zeros(n)
+        step[before.movable] = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
         places += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
     return places
 

@@ -182,7 +182,7 @@ def first_ranking(diagnosis: Diagnosis) -> Sequence[Score]:
     fit = diagnosis.nominal.fit
     if not diagnosis.found or fit.jacobian is None or fit.residual is None:
         return ()
-    return scores(diagnosis.found, Projector(fit.jacobian)(fit.residual[:, None])[:, 0])
+    return scores(diagnosis.found, Projector(fit.slopes)(fit.residual[:, None])[:, 0])
 
 
 def distinct(ranking: Sequence[Score], most: int) -> list[Score]:
@@ -249,9 +249,9 @@ def imitation(trace: Trace, fit: Fit, sizes: Array) -> tuple[float, Array]:
     Returns:
       The share of the effect that is hidden so, and the relative change of each parameter.
     """
-    assert fit.jacobian is not None
     whole, left = trace.whole @ sizes, trace.left @ sizes
-    moved = np.linalg.lstsq(fit.jacobian, whole, rcond=1e-6)[0]
+    moved = np.zeros(len(fit.at))
+    moved[fit.movable] = np.linalg.lstsq(fit.slopes, whole, rcond=1e-6)[0]
     hidden = 1 - float(np.linalg.norm(left)) / max(float(np.linalg.norm(whole)), 1e-300)
     return hidden, np.expm1(np.clip(moved, -3.0, 3.0))
 

@@ -42,13 +42,13 @@ def traces(
       replays: simulates.
       noise: weighs the samples.
     """
-    assert base.jacobian is not None and base.residual is not None
+    assert base.residual is not None
     recordings = replays.measured.recordings
     ground = [i for i, r in enumerate(recordings) if r.support == "ground"]
     fixed = [i for i in range(len(recordings)) if i not in ground]
     together = _together(hypotheses, replays.measured.robot)
     members = {h for several in together.values() for h in several}
-    project = Projector(base.jacobian)
+    project = Projector(base.slopes)
 
     def simulated(some: Iterable[Hypothesis], where: Sequence[int]) -> dict[Hypothesis, Array]:
         return _simulated(list(some), where, base, replays, noise)
