@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from pup.diagnosis import selection
 from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.engine import Diagnosis, diagnose
-from pup.diagnosis.evidence import Projector, scores, threshold
+from pup.diagnosis.evidence import Projector, Trace, scores, threshold
 from pup.diagnosis.fitting import ENOUGH, Fit, fit_together
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.noise import noise_floor, quanta, quiet_noise
@@ -66,6 +67,7 @@ def test_what_a_large_effect_hides_is_found_beside_it(monkeypatch: pytest.Monkey
     Of very many hypotheses the hopeless are not simulated again.
     """
     monkeypatch.setattr(selection, "LEADING", 30)
+    monkeypatch.setattr(selection, "MOST", 30)
     missing = {
         f"torque_speed_limit/slope@{SERVO}": 0.03,
         f"derivative_kick/gain@{SERVO}": 0.3,
@@ -253,6 +255,7 @@ def test_an_effect_is_simulated_again_for_its_best_form_in_all_its_forms(
     known = [h for h in hypotheses(measured) if h.effect in tried]
     found = traces(known, fit, replays, noise)
     monkeypatch.setattr(selection, "LEADING", 1)
+    monkeypatch.setattr(selection, "MOST", 1)
     selector = selection.Selector(replays, noise, found, 15.0, fit)
     monkeypatch.setattr(selection, "traces", lambda leading, *more: asked.extend(leading) or [])
     asked: list[Hypothesis] = []
@@ -267,6 +270,40 @@ def test_an_effect_is_simulated_again_for_its_best_form_in_all_its_forms(
     )
     assert asked == [h for h in known if h.effect == "cogging"]
     assert {t.hypothesis.effect for t in kept} == set(tried) - {"cogging"}
+
+
+def test_where_an_effect_changes_all_others_they_are_all_simulated_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What looked like the errors before is a guide as long as it does what it did."""
+    measured = Measured.of(BENCH, recordings({}))
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    noise = Noise(np.full(3, 0.002), np.zeros(3), "assumed")
+    fit = as_described(replays)
+    fit_together([fit], replays, noise, iterations=8)
+    tried = ("backlash", "joint_spring", "coulomb_friction", "encoder_bias", "gain_asymmetry")
+    known = [h for h in hypotheses(measured) if h.effect in tried]
+    found = traces(known, fit, replays, noise)
+    monkeypatch.setattr(selection, "LEADING", 2)
+    counted: list[int] = []
+    simulate = selection.traces
+
+    def counting(some: Sequence[Hypothesis], *more: Any) -> list[Trace]:
+        counted.append(len(some))
+        return simulate(some, *more)
+
+    monkeypatch.setattr(selection, "traces", counting)
+    selector = selection.Selector(replays, noise, found, 15.0, fit)
+    assert len(selector._traced_anew(fit, known)) == len(found)
+    assert len(counted) == 1
+    assert counted[0] < len(known)
+    rng = np.random.default_rng(0)
+    selector.found = tuple(replace(t, whole=rng.normal(size=t.whole.shape)) for t in found)
+    counted.clear()
+    anew = {t.hypothesis: t for t in selector._traced_anew(fit, known)}
+    assert sum(counted) == len(known)
+    for trace in found:
+        assert anew[trace.hypothesis].whole == pytest.approx(trace.whole)
 
 
 def test_what_was_replayed_is_not_replayed_again(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ parameters is not. Effects are added one by one, the best first, as long as they
 by more than chance and predict types of motion that were left out; then each is tried without.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,9 +43,11 @@ HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
 """So many of them are refitted to the end, if they are within so much chi-squared of the best."""
-LEADING = 400
-"""Hypotheses that are simulated again around a model that has an effect more: where there are more,
-those that looked most like its errors before."""
+LEADING, MOST = 80, 400
+"""Hypotheses that are simulated again around a model that has an effect more: those that looked
+most like its errors before, and so many more where that was no guide."""
+ALIKE = 0.8
+"""Least cosine of what a hypothesis leaves before and after, for the ranking to be a guide."""
 SWAPS, RIVALS = 2, 2
 """Effects that may be exchanged, and rivals that each may be exchanged for."""
 PLACES = 16
@@ -237,21 +239,23 @@ class Selector:
         return [t for t in self.found if t.hypothesis.key not in known]
 
     def _traced_anew(self, fit: Fit, rest: Sequence[Hypothesis]) -> tuple[Trace, ...]:
-        """Traces around a fit; where there are very many, those of the hopeless as they were."""
-        assert fit.residual is not None
+        """Traces around a fit; where there are many, those of the hopeless as they were."""
         project = Projector(fit.slopes)
         kept = {h.key for h in rest}
-        old = [t for t in self.found if t.hypothesis.key in kept]
-        again = [traced(t.hypothesis, t.whole, project) for t in old]
-        ranking = scores([t for t in again if t is not None], project(fit.residual[:, None])[:, 0])
+        before = (t for t in self.found if t.hypothesis.key in kept)
+        known = (traced(t.hypothesis, t.whole, project) for t in before)
+        old = {t.hypothesis: t for t in known if t is not None}
         place: dict[tuple[str, Place], int] = {}
-        for rank, score in enumerate(ranking):  # by the best of its forms
-            place.setdefault(score.trace.hypothesis.key, rank)
-        ordered = sorted(rest, key=lambda h: place.get(h.key, len(ranking)))
-        left = {h.key for h in ordered[:LEADING]}
-        leading = [h for h in ordered if h.key in left]
+        for rank, score in enumerate(scores(list(old.values()), _unimitated(fit))):
+            place.setdefault(score.trace.hypothesis.key, rank)  # by the best of its forms
+        ordered = sorted(rest, key=lambda h: place.get(h.key, len(rest)))
+        leading = _whole(ordered, LEADING)
         new = traces(leading, fit, self.replays, self.noise)
-        return (*new, *(s.trace for s in ranking if s.trace.hypothesis.key not in left))
+        more = _whole(ordered, MOST)[len(leading) :]
+        if more and _changed(old, new) > 0.5:
+            leading, new = [*leading, *more], new + traces(more, fit, self.replays, self.noise)
+        again = {h.key for h in leading}
+        return (*new, *(t for t in old.values() if t.hypothesis.key not in again))
 
     def blur(self, model: Model, share: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
@@ -345,6 +349,19 @@ class Selector:
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
     return {hypothesis.effect for hypothesis in hypotheses}
+
+
+def _whole(ordered: Sequence[Hypothesis], number: int) -> list[Hypothesis]:
+    """The first ones, each with all its forms."""
+    first = {h.key for h in ordered[:number]}
+    return [h for h in ordered if h.key in first]  # forms of one effect stand together
+
+
+def _changed(old: Mapping[Hypothesis, Trace], new: Sequence[Trace]) -> float:
+    """Share of traces that are not what they were."""
+    both = [(old[t.hypothesis].left, t.left) for t in new if t.hypothesis in old]
+    cosines = [np.vdot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)) for a, b in both]
+    return float(np.mean(np.array(cosines) < ALIKE)) if cosines else 1.0
 
 
 def _unimitated(fit: Fit) -> Array:
