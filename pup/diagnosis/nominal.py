@@ -29,9 +29,9 @@ FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
 """Frictions that a fit may start from on the ground."""
 SPREAD = 0.35
 """Of the starts around the nominal values, in logarithms."""
-NEAR = (0.1, 0.025)
-"""Spreads of starts around the best fit, where far ones disagree. The second is for the ground,
-where a start may make the robot fall, which leads nowhere."""
+NEAR = (0.1, 0.025, 0.025, 0.01)
+"""Spreads of starts around the best fit, where far ones disagree, one after the other. The smaller
+are for where a start may lead nowhere: a robot on the ground falls, a servo gets out of step."""
 AGREEMENT = 3e-3
 """Two starts agree in chi-squared to this share of it, to ABSOLUTE, to SPARE of the noise, or to
 EXCESS of what is more than noise: where much is missing, a fit has many ends that lack it all the
@@ -125,7 +125,7 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     noise = noise_floor(measured, measured.values - replays([tried[0].row()])[0])
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
-    for away in NEAR if ground else NEAR[:1]:
+    for away in NEAR:
         if _agree(*fits):
             break
         fits = _around(min(fits, key=lambda fit: fit.chi2), away, replays, noise, rng)
