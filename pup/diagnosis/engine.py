@@ -25,6 +25,7 @@ from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.poor import Poor, why_poor
 from pup.diagnosis.regimes import Regime, regimes
+from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.search import Search, followed, search
@@ -182,7 +183,9 @@ def diagnose(
         "model": final,
         "unexplained": left,
     }
-    if not model.hypotheses and not left:
+    errors = measured.values - replays([final.fit.row()])[0]
+    odd = unrepeated(measured, np.nan_to_num(errors), nominal.noise, seen)
+    if not model.hypotheses and not left and not odd:
         return told("none", slight, **evidence)
     progress("where", 0.87)
     differentiate([final.fit], replays, nominal.noise)
@@ -194,8 +197,8 @@ def diagnose(
     named = findings(model, rounds, selector, measured, seen) if model.hypotheses else ()
     progress("next recording", 0.95)
     ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
-    every = (*named, left.finding) if left else named
-    evidence["findings"] = in_order(every)
+    nameless = left.finding if left else odd
+    evidence["findings"] = in_order((*named, nameless) if nameless else named)
     return told("mismatch", ask=ask, **evidence)
 
 

@@ -42,11 +42,13 @@ class Difference:
       channel: which.
       errors: shape (n,), rad.
       speed: of the motion about them, by as much as lateness shows in `errors`, (n,), rad/s.
+      samples: the numbers of those of the first of the two, shape (n,).
     """
 
     channel: int
     errors: Array
     speed: Array
+    samples: NDArray[np.intp]
 
 
 @dataclass(frozen=True)

@@ -56,15 +56,15 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
       errors: measured minus simulated, shape (n_samples,), rad.
     """
     pairs = repeats(measured)
-    differences = [d for a, b in pairs for d in _differences(measured, errors, a, b)]
+    differing = differences(measured, errors)
     told: dict[int, tuple[float, float]] = {}
     readings, late = [], None
-    if differences:
+    if differing:
         # On the ground, impacts make motions differ everywhere, and no rest tells the noise alone.
         ground = any(measured.recordings[a].support == "ground" for a, _ in pairs)
-        late = None if ground else lateness(differences, _least(measured))
-        told = {c: (s, late.rho) for c, s in late.sigma.items()} if late else _spreads(differences)
-        counts = np.bincount([d.channel for d in differences], [len(d.errors) for d in differences])
+        late = None if ground else lateness(differing, _least(measured))
+        told = {c: (s, late.rho) for c, s in late.sigma.items()} if late else _spreads(differing)
+        counts = np.bincount([d.channel for d in differing], [len(d.errors) for d in differing])
         readings = [int(n) for n in counts if n]
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
     if not told:
@@ -193,6 +193,16 @@ def repeats(measured: Measured) -> list[tuple[int, int]]:
     return pairs
 
 
+def differences(measured: Measured, errors: Array) -> list[Difference]:
+    """What differs between repeats, by channel.
+
+    Args:
+      measured: the samples.
+      errors: measured minus simulated, shape (n_samples,), rad.
+    """
+    return [d for a, b in repeats(measured) for d in _differences(measured, errors, a, b)]
+
+
 def _differences(measured: Measured, errors: Array, a: int, b: int) -> list[Difference]:
     """What differs between two repeats, by channel."""
     out = []
@@ -216,8 +226,19 @@ def _differences(measured: Measured, errors: Array, a: int, b: int) -> list[Diff
         difference = (errors[first][near] - matched) / np.sqrt(variance)
         speeds = measured.speed[first][near] ** 2 + measured.speed[second][at] ** 2
         speed = np.sqrt(speeds / variance)  # neighbours are late together
-        out.append(Difference(channel, difference, speed))
+        samples = np.flatnonzero(first)[near]
+        out.append(Difference(channel, difference, speed, samples))
     return out
+
+
+def flutter(measured: Measured, errors: Array, channel: int) -> float | None:
+    """What a channel's readings flutter by from tick to tick, where they are quiet, rad.
+
+    Noise without a memory is as large; one that remembers itself is larger. None where nothing was
+    read.
+    """
+    _, bends = _changes(measured, errors, channel)
+    return float(np.sqrt(_moments(bends)[0] / 6)) if bends else None
 
 
 def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, float] | None:
@@ -226,6 +247,17 @@ def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, fl
     Where commands never rest, the quieter half of all that bends stands for rest; where errors
     drift at rest, bends tell the noise alone, but not its memory.
     """
+    steps, bends = _changes(measured, errors, channel)
+    if sum(map(len, steps)) >= 8:
+        variance, follows = _moments(steps)
+        rho = max(1 + 2 * follows / max(variance, 1e-300), 0.0)
+        if rho <= MEMORY:
+            return float(np.sqrt(variance / (2 * (1 - rho)))), rho
+    return (float(np.sqrt(_moments(bends)[0] / 6)), 0.0) if bends else None
+
+
+def _changes(measured: Measured, errors: Array, channel: int) -> tuple[list[Array], list[Array]]:
+    """First differences of errors while no command changes, and second ones of what is quiet."""
     steps: list[Array] = []
     bends: list[Array] = []
     for number, recording in enumerate(measured.recordings):
@@ -240,12 +272,7 @@ def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, fl
         bend = np.diff(step)
         quiet = 2 * bend[np.abs(bend) <= np.median(np.abs(bend))]
         bends += [np.diff(rest) for rest in rests] or [quiet]
-    if sum(map(len, steps)) >= 8:
-        variance, follows = _moments(steps)
-        rho = max(1 + 2 * follows / max(variance, 1e-300), 0.0)
-        if rho <= MEMORY:
-            return float(np.sqrt(variance / (2 * (1 - rho)))), rho
-    return (float(np.sqrt(_moments(bends)[0] / 6)), 0.0) if bends else None
+    return steps, bends
 
 
 def _calm(recording: Recording, time: Array) -> NDArray[np.bool_]:

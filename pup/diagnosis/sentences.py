@@ -130,6 +130,12 @@ def _nameless(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:
         like = f"; the best law for it explains only {percent(share)} of it"
         if share > MOSTLY:
             like = f"; it acts like the torque {minus(finding.law.removeprefix('tau += '))}"
+    if "spread" in finding.parameters:
+        apart, flutter = (finding.parameters[n].value for n in ("spread", "flutter"))
+        like = (
+            f" and does not repeat: a motion done again differs by {speech.quantity(apart, 'rad')}"
+            f", {apart / flutter:.0f} times what its readings flutter by"
+        )
     return f"{capital(WORDS[NAMELESS])} happens {where}{like}."
 
 
