@@ -237,8 +237,7 @@ def flutter(measured: Measured, errors: Array, channel: int) -> float | None:
     Noise without a memory is as large; one that remembers itself is larger. None where nothing was
     read.
     """
-    _, bends = _changes(measured, errors, channel)
-    return float(np.sqrt(_moments(bends)[0] / 6)) if bends else None
+    return _bending(_changes(measured, errors, channel)[1])
 
 
 def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, float] | None:
@@ -253,7 +252,13 @@ def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, fl
         rho = max(1 + 2 * follows / max(variance, 1e-300), 0.0)
         if rho <= MEMORY:
             return float(np.sqrt(variance / (2 * (1 - rho)))), rho
-    return (float(np.sqrt(_moments(bends)[0] / 6)), 0.0) if bends else None
+    alone = _bending(bends)
+    return None if alone is None else (alone, 0.0)
+
+
+def _bending(bends: Sequence[Array]) -> float | None:
+    """Standard deviation of noise without a memory, by second differences."""
+    return float(np.sqrt(_moments(bends)[0] / 6)) if bends else None
 
 
 def _changes(measured: Measured, errors: Array, channel: int) -> tuple[list[Array], list[Array]]:

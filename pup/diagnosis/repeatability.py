@@ -46,6 +46,7 @@ def unrepeated(
             squares[difference.samples] += difference.errors**2
             readings += len(difference.errors)
     spread, hidden = float(noise.sigma[joint]), 1 - 1 / apart[joint] ** 2
+    flutters = spread / apart[joint]
     reach = 1.645 / np.sqrt(2 * max(readings, 1))
     return Finding(
         effect="unknown",
@@ -54,7 +55,7 @@ def unrepeated(
         when=tuple(windows(measured, squares)),
         parameters={
             "spread": Parameter(spread, "rad", spread * (1 - reach), spread * (1 + reach)),
-            "flutter": Parameter(*_exactly(spread / apart[joint])),
+            "flutter": Parameter(flutters, "rad", flutters, flutters),
         },
         probability=hidden,
         equivalents=(),
@@ -62,10 +63,6 @@ def unrepeated(
         law=None,
         gain=hidden * float(np.sum(measured.channel == joint)),
     )
-
-
-def _exactly(value: float) -> tuple[float, str, float, float]:
-    return value, "rad", value, value
 
 
 def _apart(measured: Measured, errors: Array, noise: Noise, channel: int) -> float:

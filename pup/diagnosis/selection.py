@@ -187,7 +187,7 @@ class Selector:
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
-        ranking = scores(self._traces(model), _unimitated(fit))
+        ranking = scores(self._traces(model), unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
             return None
         tried = self._begun(model, ranking)
@@ -225,7 +225,7 @@ class Selector:
         if fit is None:
             return [], []
         found = traces(hypotheses(self.replays.measured), fit, self.replays, self.noise)
-        ranking = scores(found, _unimitated(fit))
+        ranking = scores(found, unimitated(fit))
         return ranking, self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
 
     def _traces(self, model: Model) -> list[Trace]:
@@ -246,7 +246,7 @@ class Selector:
         known = (traced(t.hypothesis, t.whole, project) for t in before)
         old = {t.hypothesis: t for t in known if t is not None}
         place: dict[tuple[str, Place], int] = {}
-        for rank, score in enumerate(scores(list(old.values()), _unimitated(fit))):
+        for rank, score in enumerate(scores(list(old.values()), unimitated(fit))):
             place.setdefault(score.trace.hypothesis.key, rank)  # by the best of its forms
         ordered = sorted(rest, key=lambda h: place.get(h.key, len(rest)))
         leading = _whole(ordered, LEADING)
@@ -364,7 +364,7 @@ def _changed(old: Mapping[Hypothesis, Trace], new: Sequence[Trace]) -> float:
     return float(np.mean(np.array(cosines) < ALIKE)) if cosines else 1.0
 
 
-def _unimitated(fit: Fit) -> Array:
+def unimitated(fit: Fit) -> Array:
     """What a fit leaves that none of its own coordinates can imitate, shape (n_samples,)."""
     assert fit.residual is not None
     return Projector(fit.slopes)(fit.residual[:, None])[:, 0]

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.evidence import Projector, Score, Trace, overlap, scores
+from pup.diagnosis.evidence import Score, Trace, overlap, scores
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.gains import MATERIAL
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.regimes import Window, windows
-from pup.diagnosis.selection import KEPT
+from pup.diagnosis.selection import KEPT, unimitated
 from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
 from pup.physics.terms import Place
 
@@ -182,7 +182,7 @@ def first_ranking(diagnosis: Diagnosis) -> Sequence[Score]:
     fit = diagnosis.nominal.fit
     if not diagnosis.found or fit.jacobian is None or fit.residual is None:
         return ()
-    return scores(diagnosis.found, Projector(fit.slopes)(fit.residual[:, None])[:, 0])
+    return scores(diagnosis.found, unimitated(fit))
 
 
 def distinct(ranking: Sequence[Score], most: int) -> list[Score]:
