@@ -107,7 +107,7 @@ class Fit:
     @property
     def movable(self) -> NDArray[np.bool_]:
         """Whether each coordinate can go where chi-squared is lower, shape (n_free,)."""
-        _, downhill = _normal(self)
+        downhill = _downhill(self)
         above = self.at > np.array([c.upper for c in self.coordinates]) - ALMOST
         below = self.at < np.array([c.lower for c in self.coordinates]) + ALMOST
         return ~(above & (downhill > 0) | below & (downhill < 0))
@@ -279,11 +279,16 @@ def _dampings(fit: Fit) -> tuple[float, ...]:
 
 def _normal(fit: Fit) -> tuple[Array, Array]:
     """The normal matrix, and half of chi-squared's slope downhill."""
+    assert fit.jacobian is not None
+    jacobian = fit.jacobian if fit.weight is None else fit.jacobian * fit.weight[:, None]
+    return jacobian.T @ jacobian, _downhill(fit)
+
+
+def _downhill(fit: Fit) -> Array:
+    """Half of chi-squared's slope downhill, shape (n_free,)."""
     assert fit.jacobian is not None and fit.residual is not None
-    if fit.weight is None:
-        return fit.jacobian.T @ fit.jacobian, fit.jacobian.T @ fit.residual
-    jacobian = fit.jacobian * fit.weight[:, None]
-    return jacobian.T @ jacobian, jacobian.T @ (fit.residual * fit.weight)
+    squares = 1.0 if fit.weight is None else fit.weight**2
+    return np.asarray(fit.jacobian.T @ (fit.residual * squares))
 
 
 def _promise(fit: Fit, to: Array) -> float:

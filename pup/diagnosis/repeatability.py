@@ -8,6 +8,8 @@ reading to the next they are told apart: there an encoder is as noisy as ever.
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.laws import NAMELESS
+from pup.diagnosis.locate import BAND
 from pup.diagnosis.noise import differences, flutter, quanta
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
@@ -47,9 +49,9 @@ def unrepeated(
             readings += len(difference.errors)
     spread, hidden = float(noise.sigma[joint]), 1 - 1 / apart[joint] ** 2
     flutters = spread / apart[joint]
-    reach = 1.645 / np.sqrt(2 * max(readings, 1))
+    reach = BAND / np.sqrt(2 * max(readings, 1))
     return Finding(
-        effect="unknown",
+        effect=NAMELESS,
         place=Place("joint", measured.robot.joint_names[joint]),
         regime=strongest(found, squares),
         when=tuple(windows(measured, squares)),

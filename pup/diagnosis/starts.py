@@ -63,7 +63,7 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
     assert before.residual is not None
     n, trace = len(before.at), score.trace.whole
     sizes = fit.at[n : n + trace.shape[1]]
-    slopes = before.slopes
+    movable, slopes = before.movable, before.slopes
     normal = slopes.T @ slopes
     normal[np.diag_indices_from(normal)] += 1 + DAMPED * np.diag(normal)
     low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
@@ -73,7 +73,7 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
         at[n : n + len(sizes)] = share * sizes
         left = slopes.T @ (before.residual - trace @ (share * sizes))
         step = np.zeros(n)
-        step[before.movable] = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
+        step[movable] = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
         places += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
     return places
 
