@@ -36,7 +36,7 @@ test: lint $(VENV)/.tested
 	$(BIN)/python -m pytest
 
 slow: $(VENV)/.tested
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 0
 
 docs: $(VENV)/.installed
 	$(BIN)/mkdocs build --strict
