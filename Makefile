@@ -32,11 +32,12 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Two processes: fixtures of a file are made once, and no test runs in the one whose exit counts.
 test: lint $(VENV)/.tested
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 slow: $(VENV)/.tested
-	$(BIN)/python -m pytest -m slow -n 0
+	$(BIN)/python -m pytest -m slow
 
 docs: $(VENV)/.installed
 	$(BIN)/mkdocs build --strict
