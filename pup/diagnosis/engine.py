@@ -28,7 +28,7 @@ from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.search import Search, followed, search
+from pup.diagnosis.search import Search, followed, search, search_on
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.splits import Split, splits
 from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out, in_order
@@ -159,7 +159,7 @@ def diagnose(
         return told("undetermined", _unsettled(nominal))
     done = search(replays, nominal, rng, progress, first[1] if first else None, effects)
     if done is not None and nominal.noise.source == "assumed":
-        nominal, done = _weighed(nominal, done, replays, rng, progress, first, effects)
+        nominal, done = _weighed(nominal, done, replays, rng, progress, effects)
     if done is None:
         return told("undetermined", "the motions would not show any effect of the library")
     rounds, selector = done.rounds, done.selector
@@ -214,10 +214,9 @@ def _weighed(
     replays: Replays,
     rng: np.random.Generator,
     progress: Progress,
-    first: tuple[Nominal, Search] | None,
     effects: int,
-) -> tuple[Nominal, Search | None]:
-    """The search done again where what it leaves is not the noise that it was weighed by.
+) -> tuple[Nominal, Search]:
+    """The search gone on with where what it leaves is not the noise that it was weighed by.
 
     With nothing recorded twice, noise is first taken from how errors flicker at rest, of which
     there may be little.
@@ -235,8 +234,7 @@ def _weighed(
     certificate = nominal.certificate
     left = certificate.left * fit.chi2 / nominal.fit.chi2
     nominal = Nominal(fit, noise, replace(certificate, left=left))
-    known = first[1] if first else None
-    return nominal, search(replays, nominal, rng, progress, known, effects)
+    return nominal, search_on(done, replays, nominal, rng, progress, effects)
 
 
 def _matters(

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_banded
 
 from pup.diagnosis.knocks import knocked
 from pup.physics.simulator import Trajectories, tick_slices
@@ -142,16 +143,27 @@ class Measured:
         flat = np.hstack([trajectories.position.reshape(n, -1), trajectories.tilt.reshape(n, -1)])
         return flat[:, self.index]
 
+    def memory(self, noise: Noise) -> Array:
+        """Correlation of each sample's noise with that of the one before, shape (n_samples,)."""
+        # The share of readings in the variance.
+        read = (noise.sigma[self.channel] / self.deviation(noise)) ** 2
+        rho = noise.rho[self.channel] * read + noise.rho_late * (1 - read)
+        return np.where(self._follows, rho, 0.0)
+
     def whiten(self, errors: Array, noise: Noise) -> Array:
         """Errors (..., n_samples), rad, in units of uncorrelated noise."""
-        deviation = self.deviation(noise)
-        read = (noise.sigma[self.channel] / deviation) ** 2  # the share of readings in the variance
-        rho = np.where(
-            self._follows, noise.rho[self.channel] * read + noise.rho_late * (1 - read), 0.0
-        )
-        scaled = errors / deviation
+        rho = self.memory(noise)
+        scaled = errors / self.deviation(noise)
         before = np.concatenate([scaled[..., :1], scaled[..., :-1]], axis=-1)
         return np.asarray((scaled - rho * before) / np.sqrt(1 - rho**2))
+
+    def coloured(self, white: Array, noise: Noise) -> Array:
+        """Errors (..., n_samples), rad, whose whitening is given."""
+        rho = self.memory(noise)
+        system = np.stack([np.ones_like(rho), np.append(-rho[1:], 0.0)])  # bidiagonal
+        right = (white * np.sqrt(1 - rho**2)).reshape(-1, len(rho)).T
+        scaled = solve_banded((1, 0), system, right).T.reshape(white.shape)
+        return np.asarray(scaled * self.deviation(noise))
 
     def only(self, recordings: Sequence[int]) -> NDArray[np.bool_]:
         """Which samples are of some recordings."""

@@ -19,7 +19,9 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Nominal
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
+from pup.diagnosis.reweighing import Reweighing
 from pup.diagnosis.selection import Selector
+from pup.diagnosis.starts import closely
 from pup.diagnosis.tracing import traces
 from pup.physics.terms.scale import Scale
 
@@ -44,6 +46,7 @@ class Search:
       model: the model that is left.
       rounds: how it came about.
       found: traces of all hypotheses.
+      base: the fit that they were found around.
       enough: surprise that chance does not reach.
     """
 
@@ -51,6 +54,7 @@ class Search:
     model: Model
     rounds: tuple[Round, ...]
     found: tuple[Trace, ...]
+    base: Fit
     enough: float
 
 
@@ -78,14 +82,7 @@ def search(
     if not found:
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
-
-    def told(model: Model) -> None:
-        newest, number = model.hypotheses[-1], len(model.hypotheses)
-        progress(
-            f"refits, {newest.effect} at {newest.place} found",
-            0.5 + 0.3 * number / (number + HALFWAY),
-        )
-
+    told = _teller(progress)
     selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base, most, told)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
@@ -95,7 +92,64 @@ def search(
     model, rounds = selector.run(start)
     if model.fit.jacobian is None:
         differentiate([model.fit], replays, nominal.noise)
-    return Search(selector, model, (*before, *rounds), tuple(found), enough)
+    return Search(selector, model, (*before, *rounds), tuple(found), base, enough)
+
+
+def search_on(
+    done: Search,
+    replays: Replays,
+    nominal: Nominal,
+    rng: np.random.Generator,
+    progress: Callable[[str, float], None],
+    most: int = 8,
+) -> Search:
+    """Go on with a search where its samples are weighed by another noise.
+
+    It begins at the model that was found, and may add to it, exchange its effects or do without.
+
+    Args:
+      done: the search, by another noise.
+      replays: simulates.
+      nominal: the fit of the nominal model, by this one.
+      rng: draws noise.
+      progress: told the stage and the share of all that is done.
+      most: effects that are looked for.
+    """
+    progress("refits, noise told anew", 0.65)
+    turned = Reweighing(replays.measured, done.selector.noise, nominal.noise)
+    base = turned.fit(done.base)
+    found = turned.traces(done.found, base)
+    enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
+    fit = turned.fit(done.model.fit) if done.model.hypotheses else nominal.fit
+    closely([fit], replays, nominal.noise)
+    differentiate([fit] if fit.jacobian is None else [], replays, nominal.noise)
+    near = done.selector.base is done.model.fit
+    latest = turned.traces(done.selector.found, fit)
+    around = fit if near else base
+    told = _teller(progress)
+    selector = Selector(replays, nominal.noise, latest, enough, nominal.fit, around, most, told)
+    start = (
+        selector.model(done.model.hypotheses, fit) if done.model.hypotheses else selector.nominal
+    )
+    known = {done.selector.nominal: selector.nominal, done.model: start}
+    rounds = turned.rounds(done.rounds, known, selector)
+    earlier = [r for r in done.rounds if r.before.measured is not replays.measured]
+    model, rounds = selector.run(start, rounds)
+    differentiate([model.fit] if model.fit.jacobian is None else [], replays, nominal.noise)
+    return Search(selector, model, (*earlier, *rounds), tuple(found), base, enough)
+
+
+def _teller(progress: Callable[[str, float], None]) -> Callable[[Model], None]:
+    """Tells of each effect that is added."""
+
+    def told(model: Model) -> None:
+        newest, number = model.hypotheses[-1], len(model.hypotheses)
+        progress(
+            f"refits, {newest.effect} at {newest.place} found",
+            0.5 + 0.3 * number / (number + HALFWAY),
+        )
+
+    return told
 
 
 def _carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:

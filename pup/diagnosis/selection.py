@@ -93,14 +93,15 @@ class Selector:
         self._lesser: tuple[Model | None, list[Fit]] = None, []
         self.nominal = self.predicting(self.model((), nominal))
 
-    def run(self, start: Model) -> tuple[Model, list[Round]]:
+    def run(self, start: Model, known: Sequence[Round] = ()) -> tuple[Model, list[Round]]:
         """The model that is left when nothing more is worth adding, and how it came about.
 
         Args:
           start: the nominal model, or one with effects that are known already.
+          known: rounds that led to it, with models of the same samples and noise.
         """
         model = start
-        rounds: list[Round] = []
+        rounds = list(known)
         for left in reversed(range(SWAPS + 1)):
             model = self._added(model, rounds)
             swap = self._swap(model, rounds) if left else None
@@ -202,7 +203,7 @@ class Selector:
         if not better:
             return Round(model, tuple(ranking), (), 0)
         finalists = sorted(self.models(better), key=lambda m: m.worth)
-        holds = [m for m in finalists if self._holds(model, m)]
+        holds = [m for m in finalists if self.holds(model, m)]
         if holds:
             holds[0] = self._ended(holds[0])
         others = [m for m in finalists if m not in holds]
@@ -286,7 +287,7 @@ class Selector:
         ]
         closely(close, self.replays, self.noise)
 
-    def _holds(self, before: Model, after: Model) -> bool:
+    def holds(self, before: Model, after: Model) -> bool:
         """Whether an effect keeps its gain where it was not fitted, and matters."""
         inside = before.fit.chi2 - after.fit.chi2
         outside = float((before.held_out - after.held_out).sum())
@@ -302,14 +303,15 @@ class Selector:
 
     def _without(self, model: Model) -> Model:
         """The model less whatever it can do without."""
-        while len(model.hypotheses) > 1:
-            fits = self.without(model)
+        while model.hypotheses:
+            alone = len(model.hypotheses) == 1
+            fits = [self.nominal.fit] if alone else self.without(model)
             costs = [fit.chi2 - model.fit.chi2 for fit in fits]
             spare = int(np.argmin(costs))
             if costs[spare] > self.enough:
                 return model
             left = [h for i, h in enumerate(model.hypotheses) if i != spare]
-            model = self._ended(self.model(left, fits[spare]))
+            model = self._ended(self.model(left, fits[spare])) if left else self.nominal
         return model
 
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
