@@ -20,7 +20,7 @@ from pup.diagnosis.fitting import Fit, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
-from pup.diagnosis.noise import assumed_noise, quiet_noise
+from pup.diagnosis.noise import assumed_noise, quiet_noise, told_anew
 from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.poor import Poor, why_poor
@@ -40,10 +40,6 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-SAME_SIGMA, SAME_RHO = 0.1, 0.15
-"""Noise told anew that differs by less, as a share and in its memory, is what was assumed."""
-ASTRAY = 1.7
-"""Noise told anew that is larger by more is no noise: the model is wrong everywhere."""
 ALONE = 0.5
 """Mean square of a channel's errors beyond its noise, in that of the noise, from which something
 that has no name is told though no law of it predicts motions left out."""
@@ -183,8 +179,7 @@ def diagnose(
         "model": final,
         "unexplained": left,
     }
-    errors = measured.values - replays([final.fit.row()])[0]
-    odd = unrepeated(measured, np.nan_to_num(errors), nominal.noise, seen)
+    odd = unrepeated(measured, np.nan_to_num(_errors(final.fit, replays)), nominal.noise, seen)
     if not model.hypotheses and not left and not odd:
         return told("none", slight, **evidence)
     progress("where", 0.87)
@@ -200,6 +195,11 @@ def diagnose(
     nameless = left.finding if left else odd
     evidence["findings"] = in_order((*named, nameless) if nameless else named)
     return told("mismatch", ask=ask, **evidence)
+
+
+def _errors(fit: Fit, replays: Replays) -> Array:
+    """Measured minus simulated, shape (n_samples,), rad; NaN where a simulation diverged."""
+    return np.asarray(replays.measured.values - replays([fit.row()])[0])
 
 
 def _instead(measured: Measured, poor: Poor | None, seed: int) -> NextRecording:
@@ -221,11 +221,9 @@ def _weighed(
     With nothing recorded twice, noise is first taken from how errors flicker at rest, of which
     there may be little.
     """
-    measured, before = replays.measured, nominal.noise
-    noise = quiet_noise(measured, measured.values - replays([done.model.fit.row()])[0])
-    larger = noise.sigma / before.sigma
-    same = np.abs(larger - 1) < SAME_SIGMA
-    if (same & (np.abs(noise.rho - before.rho) < SAME_RHO)).all() or larger.max() > ASTRAY:
+    measured, errors = replays.measured, _errors(done.model.fit, replays)
+    noise = told_anew(nominal.noise, quiet_noise(measured, errors), measured)
+    if noise is None:
         return nominal, done
     fit = Fit(nominal.fit.coordinates, nominal.fit.at)
     fit_together([fit], replays, noise)

@@ -29,6 +29,10 @@ FEWEST_BLOCKS = 8
 """Blocks of a channel below which they tell nothing of its noise."""
 QUIET = 2.5
 """Blocks with more than so many times the usual mean square are not noise alone."""
+SAME_SIGMA, SAME_RHO = 0.1, 0.15
+"""Noise told anew that differs by less, as a share and in its memory, is what was assumed."""
+ASTRAY = 1.7
+"""Noise told anew that is larger by more is no noise: the model is wrong at that channel."""
 GAP = 1.7
 """Readings further apart than so many of the usual times have lost some between them."""
 DIGITS = 6
@@ -96,6 +100,27 @@ def quiet_noise(measured: Measured, errors: Array) -> Noise:
         follows = float(np.mean(np.concatenate([b[1:] * b[:-1] for b in kept])))
         told[channel] = np.sqrt(variance), max(follows / max(variance, 1e-300), 0.0)
     return _pooled(measured, told, "assumed", 0)
+
+
+def told_anew(before: Noise, after: Noise, measured: Measured) -> Noise | None:
+    """Noise to weigh by from now on, by what a model leaves; None where it stays as it was.
+
+    A channel that the model is wrong at keeps what it had, and where it is wrong at most of them,
+    what it leaves says nothing of noise.
+
+    Args:
+      before: the noise that the model was fitted by.
+      after: the noise that it leaves.
+      measured: the samples.
+    """
+    seen = np.unique(measured.channel)
+    larger = after.sigma / before.sigma
+    astray = larger > ASTRAY
+    same = np.abs(larger - 1) < SAME_SIGMA
+    unchanged = same & (np.abs(after.rho - before.rho) < SAME_RHO)
+    if unchanged.all() or np.mean(astray[seen]) > 0.5:
+        return None
+    return replace(after, sigma=np.where(astray, before.sigma, after.sigma))
 
 
 def _blocks(measured: Measured, errors: Array, channel: int) -> list[Array]:
