@@ -22,7 +22,7 @@ GAIN, FORESEEN = 0.3, 0.6
 """Shares of a joint's noise by which its error falls, on what was fitted and on motions left out,
 where that matters whatever the size is. A nominal fit that makes up for something small on all
 motions may be led far astray by some of them, so that more is asked of the others."""
-SHOWN, TRACE = 0.1, 0.02
+SHOWN, TRACE = 0.05, 0.02
 """The same below which an effect of any size does not show."""
 
 
