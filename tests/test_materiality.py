@@ -1,4 +1,4 @@
-"""What matters, of what was found: by the error that falls, or by its size where it shows at all."""
+"""What matters, of what was found: by the error that falls, or by a size that shows."""
 
 from dataclasses import replace
 

@@ -15,8 +15,9 @@ from pup.physics.terms.scale import Scale
 
 MODERATE = 0.5
 """A hypothesis is first looked at in this share of its typical size."""
-NOT_ALONE = frozenset(("external_force",))
-"""Effects of a wrench need the ground: a torso that is fixed does not feel one."""
+FROM_OUTSIDE = frozenset(("external_force",))
+"""Effects of a wrench: on the torso where it is free, else on links. One joint alone cannot tell a
+force on its link from a centre of mass elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -171,22 +172,24 @@ def _bodies(effect: str, measured: Measured, ground: bool) -> Iterator[Place]:
     if effect == "structural_flex":
         yield from (Place("body", model.body(b).name) for b in dict.fromkeys(carried))
         return
-    if effect in NOT_ALONE:
-        if ground and robot.torso:
+    if effect in FROM_OUTSIDE and ground:
+        if robot.torso:
             yield Place("body", robot.torso)
         return
+    least = 2 if effect in FROM_OUTSIDE else 1
     for body in range(1, model.nbody):
-        moved = body in carried or any(_is_below(model.body_parentid, body, c) for c in carried)
+        joints = sum(_is_below(model.body_parentid, body, c) for c in carried)
         free = ground and model.body(body).name == robot.torso
-        if (moved or free) and model.body_mass[body] > 0.01:
+        if (joints >= least or free) and model.body_mass[body] > 0.01:
             yield Place("body", model.body(body).name)
 
 
 def _is_below(parents: NDArray[np.int32], body: int, ancestor: int) -> bool:
+    """Whether a body is another one or hangs on it."""
     while body:
-        body = int(parents[body])
         if body == ancestor:
             return True
+        body = int(parents[body])
     return False
 
 

@@ -1,0 +1,34 @@
+"""Where effects are looked for."""
+
+import pytest
+
+from pup.diagnosis.hypotheses import hypotheses
+from pup.diagnosis.residuals import Measured
+from pup.robot import RobotDescription
+from tests.diagnoses import MOTIONS, recordings
+
+
+@pytest.mark.parametrize(
+    ("name", "bodies"),
+    [
+        ("servo_bench", set()),  # one joint cannot tell it from a centre of mass elsewhere
+        (
+            "darwin_leg",
+            {
+                "l_hip_roll_link",
+                "l_hip_pitch_link",
+                "l_knee_link",
+                "l_ank_pitch_link",
+                "l_ank_roll_link",
+            },
+        ),
+    ],
+)
+def test_a_force_from_outside_is_looked_for_where_several_joints_feel_it(
+    name: str, bodies: set[str]
+) -> None:
+    robot = RobotDescription.load(name)
+    told = hypotheses(Measured.of(robot, recordings(robot, 60, MOTIONS)))
+    assert {h.place.name for h in told if h.effect == "external_force"} == bodies
+    loads = {h.place.name for h in told if h.effect == "payload"}
+    assert bodies < loads  # any link may carry something
