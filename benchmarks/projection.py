@@ -12,18 +12,13 @@ intervals over the robots.
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.paired import ROBOT
-from benchmarks.walks import Trial, figures
-from pup.locomotion.sampling import ParameterSampler
+from benchmarks.walks import Trial, drawn, figures, whose_walks
 from pup.policy.bundle import NumpyPolicy
-from pup.robot import RobotDescription
-from pup.sysid.result import read_bounds
 
 Array = NDArray[np.float64]
 
@@ -107,16 +102,9 @@ def analysed(trial: Trial, mu: Array, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("policies", type=Path, nargs="+", help="folders of bundles")
-    parser.add_argument("--mu", type=int, default=200, help="draws of the parameters")
-    parser.add_argument("--seed", type=int, default=30_000)
-    parser.add_argument("--bounds", type=Path)
-    parser.add_argument("--robot", default=ROBOT)
-    parser.add_argument("--out", type=Path)
+    whose_walks(parser, seed=30_000)
     given = parser.parse_args()
-    robot = RobotDescription.load(given.robot)
-    bounds = read_bounds(given.bounds or robot.identified_path, robot)
-    mu = ParameterSampler(bounds).draw(np.random.default_rng(given.seed), np.arange(given.mu))
+    robot, bounds, mu = drawn(given)
     told = {}
     for folder in given.policies:
         policy = NumpyPolicy.load(folder, robot)

@@ -69,21 +69,31 @@ def figures(walks: Walks) -> dict[str, float]:
     return {**walks.summary(), "distance_lower": quartiles[0], "distance_upper": quartiles[1]}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def whose_walks(parser: argparse.ArgumentParser, seed: int) -> None:
+    """Add what says which policies walk on which robots."""
     parser.add_argument("policies", type=Path, nargs="+", help="folders of bundles")
     parser.add_argument("--mu", type=int, default=200, help="draws of the parameters")
-    parser.add_argument("--conditions", type=int, default=16, help="tried for each mu")
-    parser.add_argument("--tries", type=int, default=2, help="episodes of each condition")
-    parser.add_argument("--seed", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=seed)
     parser.add_argument("--bounds", type=Path)
     parser.add_argument("--robot", default=ROBOT)
     parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
+
+
+def drawn(given: argparse.Namespace) -> tuple[RobotDescription, FittedBounds, Array]:
+    """The robot, its bounds and draws of its parameters on their unit scale."""
     robot = RobotDescription.load(given.robot)
     bounds = read_bounds(given.bounds or robot.identified_path, robot)
     rng = np.random.default_rng(given.seed)
-    mu = ParameterSampler(bounds).draw(rng, np.arange(given.mu))
+    return robot, bounds, ParameterSampler(bounds).draw(rng, np.arange(given.mu))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    whose_walks(parser, seed=20_000)
+    parser.add_argument("--conditions", type=int, default=16, help="tried for each mu")
+    parser.add_argument("--tries", type=int, default=2, help="episodes of each condition")
+    given = parser.parse_args()
+    robot, bounds, mu = drawn(given)
     told = {}
     for folder in given.policies:
         trial = Trial(NumpyPolicy.load(folder, robot), robot, bounds)
