@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 
 from benchmarks.walks import Trial, drawn, figures, whose_walks
 from pup.policy.bundle import NumpyPolicy
+from services.experiment.statistics import Estimate, estimate, mean
 
 Array = NDArray[np.float64]
-
-DRAWS = 2000
-"""Of the robots, for intervals."""
 
 
 def moved(policy: NumpyPolicy, mu: Array) -> Array:
@@ -55,11 +53,9 @@ def exchanged(mu: Array, columns: NDArray[np.bool_], rng: np.random.Generator) -
     return out
 
 
-def interval(differences: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """90 % interval of a mean, over robots."""
-    drawn = rng.choice(differences, (DRAWS, len(differences)))
-    low, high = np.quantile(drawn.mean(axis=1), (0.05, 0.95))
-    return float(low), float(high)
+def average(differences: Array) -> Estimate:
+    """The mean of a difference over robots, with its 90 % interval."""
+    return estimate(mean, differences[:, None].tolist())
 
 
 def analysed(trial: Trial, mu: Array, seed: int) -> dict[str, Any]:
@@ -86,14 +82,14 @@ def analysed(trial: Trial, mu: Array, seed: int) -> dict[str, Any]:
         walks = trial.walks(mu, policy.project(of), seed + 1)
         row: dict[str, Any] = figures(walks)
         own = walks.distance if own is None else own
-        low, high = interval(walks.distance - own, rng)
-        row |= {"less_own": float((walks.distance - own).mean()), "interval": (low, high)}
+        less = average(walks.distance - own)
+        row |= {"less_own": less.document()}
         walked[name] = row
         print(
             f"  condition {name}: {row['distance_median']:.2f} m "
             f"({row['distance_lower']:.2f} to {row['distance_upper']:.2f}), "
             f"{row['upright_share']:.0%} without a fall; "
-            f"{row['less_own']:+.3f} m ({low:+.3f} to {high:+.3f}) on average",
+            f"{less.value:+.3f} m ({less.low:+.3f} to {less.high:+.3f}) on average",
             flush=True,
         )
     told = {names[i]: float(sensitivity[:, i].mean()) for i in order}
@@ -109,7 +105,7 @@ def main() -> None:
     for folder in given.policies:
         policy = NumpyPolicy.load(folder, robot)
         print(f"{folder}, {policy.card.method}", flush=True)
-        if policy.card.method not in ("pup", "up"):
+        if not policy.card.shape.eta:
             parser.error(f"{folder}: a policy of method {policy.card.method!r} is not conditioned")
         told[str(folder)] = analysed(Trial(policy, robot, bounds), mu, given.seed)
     if given.out:

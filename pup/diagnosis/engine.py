@@ -179,7 +179,7 @@ def diagnose(
         "model": final,
         "unexplained": left,
     }
-    odd = unrepeated(measured, np.nan_to_num(_errors(final.fit, replays)), nominal.noise, seen)
+    odd = unrepeated(measured, np.nan_to_num(replays.errors(final.fit.row())), nominal.noise, seen)
     if not model.hypotheses and not left and not odd:
         return told("none", slight, **evidence)
     progress("where", 0.87)
@@ -195,11 +195,6 @@ def diagnose(
     nameless = left.finding if left else odd
     evidence["findings"] = in_order((*named, nameless) if nameless else named)
     return told("mismatch", ask=ask, **evidence)
-
-
-def _errors(fit: Fit, replays: Replays) -> Array:
-    """Measured minus simulated, shape (n_samples,), rad; NaN where a simulation diverged."""
-    return np.asarray(replays.measured.values - replays([fit.row()])[0])
 
 
 def _instead(measured: Measured, poor: Poor | None, seed: int) -> NextRecording:
@@ -221,7 +216,7 @@ def _weighed(
     With nothing recorded twice, noise is first taken from how errors flicker at rest, of which
     there may be little.
     """
-    measured, errors = replays.measured, _errors(done.model.fit, replays)
+    measured, errors = replays.measured, replays.errors(done.model.fit.row())
     noise = told_anew(nominal.noise, quiet_noise(measured, errors), measured)
     if noise is None:
         return nominal, done

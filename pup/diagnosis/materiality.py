@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import Noise
-from pup.diagnosis.verdict import HeldOut
+from pup.diagnosis.verdict import SLIGHT, HeldOut
 
 Array = NDArray[np.float64]
 
-SMALL = 0.25
-"""Share of its typical size below which an effect is what every robot has a little of."""
 GAIN, FORESEEN = 0.3, 0.6
 """Shares of a joint's noise by which its error falls, on what was fitted and on motions left out,
 where that matters whatever the size is. A nominal fit that makes up for something small on all
@@ -39,7 +37,7 @@ def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
     if improves(model, shown, noise) or explained > GAIN:
         return True
     predicts = shown.after < shown.before and max(_gains(model, shown, noise)) > TRACE
-    return predicts and explained > SHOWN and _largest(model) >= SMALL
+    return predicts and explained > SHOWN and _largest(model) >= SLIGHT
 
 
 def improves(model: Model, shown: HeldOut, noise: Noise) -> bool:
@@ -55,8 +53,8 @@ def little(model: Model, shown: HeldOut) -> str:
     why = "hardly changes what is predicted of motions left out"
     if shown.after < shown.before:
         why = (
-            f"is below {SMALL:g} of its typical size, or hardly shows, and lowers no joint's error "
-            f"by {GAIN:g} of its noise, nor by {FORESEEN:g} on motions left out"
+            f"is below {SLIGHT:g} of its typical size, or hardly shows, and lowers no joint's "
+            f"error by {GAIN:g} of its noise, nor by {FORESEEN:g} on motions left out"
         )
     return f"found, but not material: {found}, which {why}"
 

@@ -122,7 +122,7 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     tried = _landed(tried, replays, first)
     fit_together(tried, replays, first)
     tried.sort(key=lambda fit: fit.chi2)
-    noise = noise_floor(measured, measured.values - replays([tried[0].row()])[0])
+    noise = noise_floor(measured, replays.errors(tried[0].row()))
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
     for away in NEAR:

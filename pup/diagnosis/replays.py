@@ -141,6 +141,10 @@ class Replays:
         chosen = tuple(every if recordings is None else recordings)
         return self._run([(self._batches(rows, chosen, push), len(rows))])[0]
 
+    def errors(self, row: Row) -> Array:
+        """Measured minus simulated, shape (n_samples,), rad; NaN where the simulation diverged."""
+        return np.asarray(self.measured.values - self([row])[0])
+
     def together(self, asked: Sequence[tuple[Sequence[Row], Sequence[int]]]) -> list[Array]:
         """Several calls at once, each with its rows and recordings.
 

@@ -21,10 +21,10 @@ from pup.diagnosis import (
 from pup.diagnosis.drawing import draw_robot
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS, WORDS
-from pup.diagnosis.materiality import SMALL
 from pup.diagnosis.report_findings import badge, otherwise
 from pup.diagnosis.rivals import Rivals
 from pup.diagnosis.sentences import items
+from pup.diagnosis.verdict import SLIGHT
 from pup.diagnosis.wording import Speech, capital, minus, percent
 from pup.files import write_atomic
 from pup.sysid.accuracy import JointUnits
@@ -201,8 +201,8 @@ class _Report:
             named = listed([self.speech.words(h.effect, h.place) for h in slight])
             yield (
                 f"Of {tried} of effect and place these motions show {named}, but too little to "
-                f"matter: below {SMALL:.0%} of what is typical, or of no use in predicting motions "
-                "left out of the fit. So nothing was added to the corrected robot."
+                f"matter: below {SLIGHT:.0%} of what is typical, or of no use in predicting "
+                "motions left out of the fit. So nothing was added to the corrected robot."
             )
         else:
             yield (

@@ -6,7 +6,7 @@ nominal parameters with it. What is missing is then looked for in the other moti
 search goes on with all of them from what was found there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,10 +89,7 @@ def search(
     start = selector.nominal
     if first is not None and base is not nominal.fit:
         before, start = first.rounds, selector.model(first.model.hypotheses, base)
-    model, rounds = selector.run(start)
-    if model.fit.jacobian is None:
-        differentiate([model.fit], replays, nominal.noise)
-    return Search(selector, model, (*before, *rounds), tuple(found), base, enough)
+    return _searched(selector, start, found, base, before)
 
 
 def search_on(
@@ -120,23 +117,37 @@ def search_on(
     base = turned.fit(done.base)
     found = turned.traces(done.found, base)
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
-    fit = turned.fit(done.model.fit) if done.model.hypotheses else nominal.fit
-    closely([fit], replays, nominal.noise)
-    differentiate([fit] if fit.jacobian is None else [], replays, nominal.noise)
+    known, fit = done.model.hypotheses, nominal.fit
+    if known:
+        fit = turned.fit(done.model.fit)
+        closely([fit], replays, nominal.noise)
+        if fit.jacobian is None:
+            differentiate([fit], replays, nominal.noise)
     near = done.selector.base is done.model.fit
     latest = turned.traces(done.selector.found, fit)
     around = fit if near else base
     told = _teller(progress)
     selector = Selector(replays, nominal.noise, latest, enough, nominal.fit, around, most, told)
-    start = (
-        selector.model(done.model.hypotheses, fit) if done.model.hypotheses else selector.nominal
-    )
-    known = {done.selector.nominal: selector.nominal, done.model: start}
-    rounds = turned.rounds(done.rounds, known, selector)
+    start = selector.model(known, fit) if known else selector.nominal
+    models = {done.selector.nominal: selector.nominal, done.model: start}
+    rounds = turned.rounds(done.rounds, models, selector)
     earlier = [r for r in done.rounds if r.before.measured is not replays.measured]
-    model, rounds = selector.run(start, rounds)
-    differentiate([model.fit] if model.fit.jacobian is None else [], replays, nominal.noise)
-    return Search(selector, model, (*earlier, *rounds), tuple(found), base, enough)
+    return _searched(selector, start, found, base, earlier, rounds)
+
+
+def _searched(
+    selector: Selector,
+    start: Model,
+    found: Sequence[Trace],
+    base: Fit,
+    earlier: Sequence[Round],
+    known: Sequence[Round] = (),
+) -> Search:
+    """The search from a model on, after rounds of other samples and of these."""
+    model, rounds = selector.run(start, known)
+    if model.fit.jacobian is None:
+        differentiate([model.fit], selector.replays, selector.noise)
+    return Search(selector, model, (*earlier, *rounds), tuple(found), base, selector.enough)
 
 
 def _teller(progress: Callable[[str, float], None]) -> Callable[[Model], None]:
@@ -170,7 +181,7 @@ def followed(nominal: Nominal, replays: Replays) -> list[int]:
     Empty where it loses none, or where too few are left: two types of motion, a third of all.
     """
     measured = replays.measured
-    errors = measured.values - replays([nominal.fit.row()])[0]
+    errors = replays.errors(nominal.fit.row())
     errors = np.where(np.isnan(errors), np.inf, errors)
     every = range(len(measured.recordings))
     kept = [i for i in every if not _lost(measured, errors, measured.only([i]))]
