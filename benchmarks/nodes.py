@@ -35,6 +35,7 @@ from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
 from pup.sysid.virtual import record
 from workers import reaper
+from workers.cluster import RAY_SETTINGS
 
 MARK = "PUP_NODE"
 BRIDGE, NET = "pupbridge", "10.177.0"
@@ -71,11 +72,12 @@ class Cluster(AbstractContextManager["Cluster"]):
     @property
     def environment(self) -> dict[str, str]:
         """Of nodes, and of programs that use them."""
-        return os.environ | {
+        return {
+            **os.environ,
+            **RAY_SETTINGS,
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": self.token,
             "RAY_USAGE_STATS_ENABLED": "0",
-            "RAY_worker_cap_enabled": "0",
             "RAY_health_check_period_ms": "1000",
             "RAY_health_check_failure_threshold": "5",
             "RAY_health_check_timeout_ms": "3000",

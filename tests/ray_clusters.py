@@ -13,6 +13,7 @@ import httpx
 from gateways import free_port
 
 from workers import reaper
+from workers.cluster import RAY_SETTINGS
 
 MARK = "PUP_TEST_NODE"
 """Environment variable that every process of a node has, those of its jobs too."""
@@ -96,11 +97,12 @@ class RayCluster:
         raise AssertionError(f"{node} does not start: {self._log(node).read_text()}")
 
     def _process(self, node: str, arguments: tuple[str, ...]) -> "subprocess.Popen[bytes]":
-        environment = os.environ | {
+        environment = {
+            **os.environ,
+            **RAY_SETTINGS,
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": self.token,
             "RAY_USAGE_STATS_ENABLED": "0",
-            "RAY_worker_cap_enabled": "0",
             "RAY_health_check_period_ms": "1000",
             "RAY_health_check_failure_threshold": "6",
             "RAY_health_check_timeout_ms": "3000",

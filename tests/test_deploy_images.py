@@ -25,6 +25,7 @@ from test_deploy import LINK, USER, routes
 from hardware_agent.cli import PLACE
 from services.arguments import parser
 from services.gateway.config import DATABASE_FILE, PREFIX, Config
+from workers.cluster import RAY_SETTINGS
 
 FILE = ROOT / "deploy/docker/Dockerfile"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -139,6 +140,11 @@ def known(variable: str) -> bool:
 def test_variables_of_ray_are_looked_up() -> None:
     assert known("RAY_AUTH_TOKEN_PATH") and known("RAY_worker_cap_enabled")
     assert not known("RAY_AUTH_TOKENS_PATH") and not known("RAY_worker_cap_enable")
+
+
+def test_nodes_have_the_settings_of_ray_that_jobs_count_on() -> None:
+    assert environment("cluster").items() >= RAY_SETTINGS.items()
+    assert all(known(name) for name in RAY_SETTINGS)
 
 
 def test_health_is_asked_where_it_is_told() -> None:

@@ -3,7 +3,7 @@
 When an actor dies while tasks of its own run, Ray 2.60 counts those tasks as running for ever
 (ray issue 64627), and with its cap on workers a node soon starts none but one every few seconds.
 The cap is for tasks that wait for other tasks, which ours do not: an embedded Ray is without it,
-and the nodes of a cluster are best started with RAY_worker_cap_enabled=0 in their environment.
+and the nodes of a cluster are best started with RAY_SETTINGS in their environment.
 """
 
 import logging
@@ -28,6 +28,14 @@ from workers import reaper
 
 OBJECT_STORE = 256 * 2**20  # bytes; the recordings are the largest object
 PROBE_SECONDS = 5.0
+RAY_SETTINGS = {
+    "RAY_worker_cap_enabled": "0",  # see the module
+    # A node whose link is down answers nobody, and does not refuse either: what was asked of it
+    # waits until the connection is found dead, by default after seven minutes.
+    "RAY_grpc_client_keepalive_time_ms": "10000",
+    "RAY_grpc_client_keepalive_timeout_ms": "20000",
+}
+"""Of Ray, for all processes of a cluster, in their environment."""
 
 
 @contextmanager
@@ -44,6 +52,8 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
     Raises:
       InputError: there is no cluster at that address.
     """
+    for name, value in RAY_SETTINGS.items():
+        os.environ.setdefault(name, value)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what newer Rays do
     with _messages(), _joined(address) if address else _embedded(cores):
@@ -104,7 +114,6 @@ def _embedded(cores: int | None) -> Iterator[None]:
                 log_to_driver=False,
                 logging_level=logging.ERROR,
                 object_store_memory=OBJECT_STORE,
-                _system_config={"worker_cap_enabled": False},  # see the module
                 _temp_dir=folder,
                 _node_ip_address="127.0.0.1",
             )
