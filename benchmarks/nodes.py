@@ -181,9 +181,17 @@ class Stage:
 
 def _written(pattern: str) -> Callable[[Path], float]:
     def further(out: Path) -> float:
-        return max((file.stat().st_mtime for file in out.glob(pattern)), default=0.0)
+        return max(map(_time, out.glob(pattern)), default=0.0)
 
     return further
+
+
+def _time(file: Path) -> float:
+    """When it was written; 0 of one that is gone by now, as a job tidies up at its end."""
+    try:
+        return file.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
 
 
 def _document(name: str) -> Callable[[Path], Any]:

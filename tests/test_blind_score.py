@@ -316,6 +316,15 @@ def test_intervals_are_those_of_clopper_and_pearson() -> None:
     assert calibration([], [])["ece"] is None
 
 
+def test_few_claims_are_off_by_chance_and_many_are_not() -> None:
+    few, many = [0.8] * 10, [0.8] * 1000
+    told = calibration(few, [True] * 6 + [False] * 4)
+    assert told["ece"] == pytest.approx(0.2)
+    assert told["ece_chance"] == pytest.approx(0.2)  # 6 of 10 or nearer: 97 % of binomial draws
+    assert calibration(many, [True] * 800 + [False] * 200)["ece_chance"] < 0.03
+    assert calibration([1.0], [True])["ece_chance"] == 0.0
+
+
 def test_the_command_writes_scores_and_a_table(revealed: Path) -> None:
     options = ("--set", revealed / "set", "--key", revealed / "key.json")
     where = ("--diagnoses", revealed / "diagnoses", "--out", revealed / "scores.json")

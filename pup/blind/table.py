@@ -92,7 +92,8 @@ def cell(value: Mapping[str, Any]) -> str:
     if "rate" in value:
         return f"{value['rate']:.2f} ({value['hits']}/{value['of']})"
     if "ece" in value:
-        return f"ECE {value['ece']:.3f}, Brier {value['brier']:.3f} ({value['of']})"
+        chance, brier = f"chance to {value['ece_chance']:.3f}", f"Brier {value['brier']:.3f}"
+        return f"ECE {value['ece']:.3f} ({chance}), {brier} ({value['of']})"
     return f"{value['mean']:.3g}, median {value['median']:.3g} ({value['of']})"
 
 
