@@ -50,7 +50,7 @@ def calibration(confidences: Sequence[float], right: Sequence[bool]) -> dict[str
     if not confidences:
         return {"of": 0, "ece": None, "ece_chance": None, "brier": None}
     told, true = np.array(confidences), np.array(right, dtype=np.float64)
-    drawn = np.random.default_rng(0).random((DRAWS, len(told))) < told
+    drawn = (np.random.default_rng(0).random((DRAWS, len(told))) < told).astype(np.float64)
     return {
         "of": len(told),
         "ece": float(_ece(told, true[None])[0]),
