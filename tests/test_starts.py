@@ -41,14 +41,13 @@ def test_a_fit_that_ends_far_from_the_description_is_begun_there_too(replays: Re
     assert np.isfinite(fit.chi2)
 
 
-def test_what_explains_little_of_what_is_left_is_a_puzzle(replays: Replays) -> None:
+def test_what_explains_little_or_leaves_much_is_a_puzzle(replays: Replays) -> None:
     noise = assumed_noise(replays.measured)
     before, after = nominal(), nominal()
     fit_together([before], replays, noise, iterations=0)
-    excess = before.chi2 - len(replays.measured.values)
-    assert excess > 0
-    for share, puzzle in ((0.9, True), (0.2, False)):
-        after.chi2 = len(replays.measured.values) + share * excess
+    samples = len(replays.measured.values)
+    for much, left, puzzle in ((11, 10, True), (11, 3, False), (1001, 3, False), (1001, 33, True)):
+        before.chi2, after.chi2 = float(much * samples), float(left * samples)
         assert puzzling(before, [((), after)]) is puzzle
     assert puzzling(before, [])
 

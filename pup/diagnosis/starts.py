@@ -25,9 +25,10 @@ SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
-PUZZLING = 0.5
-"""Where the best of all effects leaves this share of what is more than noise, they are begun
-elsewhere too."""
+PUZZLING, GLARING = 0.5, 30.0
+"""Where the best of all effects leaves this share of what is more than noise, or so many times the
+noise, they are begun elsewhere too: the right one may have stopped halfway, as a gear's friction
+that all but holds its joint."""
 UNUSUAL = np.log(3.0)
 """A nominal parameter further than this from the robot's description may have been led astray."""
 
@@ -79,11 +80,11 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
 
 
 def puzzling(before: Fit, tried: Sequence[Tried]) -> bool:
-    """Whether no effect explains much of what a fit leaves beyond noise."""
+    """Whether the best of some effects leaves too much of what a fit has beyond noise."""
     assert before.residual is not None
     noise = len(before.residual)
-    least = min((fit.chi2 for _, fit in tried), default=before.chi2)
-    return least - noise > PUZZLING * (before.chi2 - noise)
+    left = min((fit.chi2 for _, fit in tried), default=before.chi2) - noise
+    return left > min(PUZZLING * (before.chi2 - noise), GLARING * noise)
 
 
 def distinct(tried: Sequence[Tried]) -> list[Tried]:
