@@ -215,7 +215,7 @@ class Conductor:
         status = self._motion.status
         if status.state is not AgentState.ENABLED:
             return "enable"
-        if status.senses is not None:
+        if status.senses is not None and not self._settings.distance.renew:
             hottest = np.nanmax(np.append(status.senses.temperature, -273.0))
             safety = self._settings.safety
             if hottest > safety.cool or status.heat > safety.rested:
@@ -280,7 +280,7 @@ class Conductor:
             return
         if self.stage is Stage.PLACING and self._assign is not None:
             self.stage = Stage.SETTLING
-            self._motion.placed(self._assign)
+            self._motion.placed(self._assign, cold=self._settings.distance.renew)
         elif self.stage is Stage.MEASURING:
             self._finish(Outcome.SUCCEEDED, self._reason, told)
 

@@ -103,9 +103,14 @@ class Motion(threading.Thread):
         """The trial that stands ready may run: the journal has it."""
         self._ask(lambda senses: self._go(assign))
 
-    def placed(self, assign: Assign) -> None:
-        """Whoever puts the robot on its feet has done so, or leaves it to the robot."""
-        self._ask(lambda senses: self._placed(assign))
+    def placed(self, assign: Assign, cold: bool = False) -> None:
+        """Whoever puts the robot on its feet has done so, or leaves it to the robot.
+
+        Args:
+          assign: the trial.
+          cold: whether motors are cold now, as only those of a virtual robot can be made.
+        """
+        self._ask(lambda senses: self._placed(assign, cold))
 
     def cancel(self, reason: str) -> None:
         """End the trial that there is, standing."""
@@ -331,10 +336,12 @@ class Motion(threading.Thread):
         if isinstance(self._activity, Settle) and self._activity.assign == assign:
             self._activity.go = True
 
-    def _placed(self, assign: Assign) -> None:
+    def _placed(self, assign: Assign, cold: bool) -> None:
         trial = _trial(self._activity)
         if isinstance(trial, Settle) and trial.assign == assign:
             trial.placed = True
+            if cold:
+                self._body.guard.warm(0.0)
 
     def _cancel(self, reason: str) -> None:
         trial = _trial(self._activity)

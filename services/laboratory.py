@@ -150,12 +150,8 @@ class Laboratory(AbstractContextManager["Laboratory"]):
             self._attend()
 
     def _attend(self) -> None:
-        health = self._agent("health")
-        if health["state"] in ("disabled", "stopped", "fault"):
+        if self._agent("health")["state"] in ("disabled", "stopped", "fault"):
             self._agent("enable")
-        elif health["waiting"] == "cool":
-            # By hand; each walk begins with cold motors anyway.
-            say(self._passing / "side", {"cmd": "reset", "draw": 0})
 
     def _open(self) -> None:
         shutil.rmtree(self.keys, ignore_errors=True)

@@ -124,6 +124,22 @@ def test_an_agent_that_starts_anew_lets_windings_cool_first(tmp_path: Path) -> N
         assert time.monotonic() - before < 18
 
 
+def test_a_trial_that_is_given_cold_motors_does_not_wait_for_them(tmp_path: Path) -> None:
+    """All of the allowed heat is used up: without cold motors the rule of overload would strike."""
+    policy = bundle(tmp_path / "policies" / "still", standing())
+    (tmp_path / "state").mkdir()
+    told = {"share": 1.0, "at": time.time()}
+    (tmp_path / "state" / "warmth").write_text(json.dumps(told))
+    with at_work(tmp_path, more="[distance]\nrenew = true\n") as (made, gateway):
+        gateway.send(assign(policy, "a"))
+        waits = set()
+        while not gateway.of(Running):
+            waits.add(made.health()["waiting"])
+        assert waits <= {"", "enable"}, made.log()
+        kept = tmp_path / "state" / "warmth"
+        wait(lambda: json.loads(kept.read_text())["share"] < 0.1, 10, kept.read_text)
+
+
 def test_nonsense_of_this_computer_does_not_end_the_agent(tmp_path: Path) -> None:
     with lab(tmp_path) as made:
         made.start()
