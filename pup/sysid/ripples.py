@@ -12,15 +12,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 Array = NDArray[np.float64]
 Shares = Callable[[Array], Array]
 """Candidates (n, k) on the unit cube to each recording's share, shape (n, n_recordings)."""
 
-ROUNDS = (3, 3, 4, 12)
-"""Replays per coefficient of the surface; each round draws where the one before says to."""
-FIRST = 4.0
-"""Times as far as the local slopes say, in the first round."""
+ROUNDS = (3, 9)
+"""Replays per coefficient of the surface: of a rough one that tells in which directions to look how
+far, and of the one that counts; replays of the first count again where the second looks too."""
+SCALES = 2.0 ** np.arange(4, -8, -1)
+"""Times as far as the local slopes say: one of these is about right, as slopes of ripples claim too
+much, and far away a robot falls, upon which all that follows has nothing to do with the fit."""
+LOOKS = 24
+"""Replays that tell how much equation 1 rises at one of these scales."""
+INSIDE = 0.99
+"""Share of a normal distribution that counts as where it looks."""
 WIDEST = 0.15
 """Standard deviation of the draws, at most, on the unit cube."""
 SIGNIFICANT = 3.0
@@ -52,7 +59,7 @@ class Surface:
 
 def replays(parameters: int) -> int:
     """How many replays a surface takes."""
-    return sum(ROUNDS) * _coefficients(parameters)
+    return 1 + LOOKS * len(SCALES) + sum(ROUNDS) * _coefficients(parameters)
 
 
 def surface(shares: Shares, unit: Array, covariance: Array, hanging: Array, rise: float) -> Surface:
@@ -66,11 +73,64 @@ def surface(shares: Shares, unit: Array, covariance: Array, hanging: Array, rise
       rise: of equation 1, on average, where it is looked at.
     """
     rng = np.random.default_rng(0)
-    width = FIRST**2 * covariance
+    width = _scaled(shares, unit, covariance, hanging, rise, rng)
+    seen: _Seen | None = None
     for count in ROUNDS:
-        fitted = _fitted(shares, unit, _bounded(width), count, rng)
-        width = np.asarray(2 * rise / len(unit) * np.linalg.inv(fitted.at_least + hanging))
+        root = np.linalg.cholesky(width)
+        drawn = rng.normal(size=(count * _coefficients(len(unit)), len(unit))) @ root.T
+        seen = _look(shares, unit, drawn).beside(seen, width)
+        fitted = _fitted(seen, unit, width)
+        narrower = np.linalg.inv(fitted.at_least + hanging)
+        width = _bounded(np.asarray(2 * rise / len(unit) * narrower))
     return fitted
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Replays around a point.
+
+    Attributes:
+      off: where they are, from that point, shape (n, k).
+      told: each recording's share, shape (n, n_recordings).
+    """
+
+    off: Array
+    told: Array
+
+    def beside(self, before: "_Seen | None", covariance: Array) -> "_Seen":
+        """These and those before that lie within where draws of a covariance are."""
+        if before is None:
+            return self
+        away = (before.off * np.linalg.solve(covariance, before.off.T).T).sum(axis=1)
+        near = away < stats.chi2.ppf(INSIDE, before.off.shape[1])
+        off = np.concatenate([before.off[near], self.off])
+        return _Seen(off, np.concatenate([before.told[near], self.told]))
+
+
+def _look(shares: Shares, unit: Array, off: Array) -> _Seen:
+    """Replay around a point, within the cube."""
+    places = np.clip(unit + off, 0, 1)
+    batches = np.array_split(places, -(-len(places) // BATCH))
+    return _Seen(places - unit, np.concatenate([shares(batch) for batch in batches]))
+
+
+def _scaled(
+    shares: Shares,
+    unit: Array,
+    covariance: Array,
+    hanging: Array,
+    rise: float,
+    rng: np.random.Generator,
+) -> Array:
+    """The covariance so much wider or narrower that equation 1 rises by as much, on average."""
+    widths = [_bounded(scale**2 * covariance) for scale in SCALES]
+    drawn = rng.normal(size=(LOOKS, len(unit)))
+    off = [np.zeros((1, len(unit)))] + [drawn @ np.linalg.cholesky(w).T for w in widths]
+    seen = _look(shares, unit, np.concatenate(off))
+    level = seen.told.mean(axis=1) + ((seen.off @ hanging) * seen.off).sum(axis=1) / 2
+    risen = (level[1:] - level[0]).reshape(len(SCALES), LOOKS).mean(axis=1)
+    low = np.flatnonzero(risen <= rise)
+    return widths[int(low[0]) if len(low) else -1]
 
 
 def _coefficients(parameters: int) -> int:
@@ -83,22 +143,15 @@ def _bounded(covariance: Array) -> Array:
     return np.asarray(np.linalg.inv(narrow))
 
 
-def _fitted(
-    shares: Shares, unit: Array, covariance: Array, per_term: int, rng: np.random.Generator
-) -> Surface:
-    k = len(unit)
+def _fitted(seen: _Seen, unit: Array, covariance: Array) -> Surface:
+    k, count = len(unit), len(seen.off)
     root = np.linalg.cholesky(covariance)
-    count = per_term * _coefficients(k)
-    drawn = np.clip(unit + rng.normal(size=(count, k)) @ root.T, 0, 1)
-    batches = np.array_split(drawn, -(-count // BATCH))
-    told = np.concatenate([shares(batch) for batch in batches])
-
-    z = np.linalg.solve(root, (drawn - unit).T).T
+    z = np.linalg.solve(root, seen.off.T).T
     first, second = np.triu_indices(k)
     squares = z[:, first] * z[:, second] * np.where(first == second, 0.5, 1.0)
     terms = np.column_stack([np.ones(count), z, squares])
-    coefficients = np.linalg.lstsq(terms, told, rcond=None)[0]
-    left = (told - terms @ coefficients).mean(axis=1)
+    coefficients = np.linalg.lstsq(terms, seen.told, rcond=None)[0]
+    left = (seen.told - terms @ coefficients).mean(axis=1)
     ripple = float(left @ left) / (count - terms.shape[1])
     error = ripple * np.linalg.inv(terms.T @ terms)
 
