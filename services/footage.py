@@ -189,6 +189,10 @@ def _rendered(scene: _Scene) -> Frames:
     from mujoco.egl import GLContext
 
     height, width = SIZE
+    quality = scene.model.vis.quality
+    quality.offsamples = 0  # without a graphics card, smooth edges take half of the time
+    if not scene.model.nlight:
+        quality.shadowsize = 0  # what lights the scene throws none
     context = GLContext(width, height)
     context.make_current()
     try:
