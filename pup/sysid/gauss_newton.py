@@ -31,6 +31,8 @@ TOLERANCE = 1e-4
 FIRST_DAMPING = 1e-2
 DAMPINGS = 10.0 ** np.arange(-3.0, 2.0)
 """Damping factors tried at once, relative to the current one."""
+UPDATES = 2
+"""Steps that are taken on a Jacobian that is updated instead of made anew (Broyden), at most."""
 HEAVIER = 1e5
 """Relative damping of a second try, where none of the first improves."""
 WEAKEST = 1e-6
@@ -131,7 +133,8 @@ def least_point(
       step: of the finite differences on the unit cube.
     """
     prior = _Prior(start, anchor, None if anchor is None else np.full(len(start), sd))
-    return _descend(residuals, np.clip(start, 0.0, 1.0), prior, iterations, TOLERANCE, (step,)).at
+    begin = np.clip(start, 0.0, 1.0)
+    return _descend(residuals, begin, prior, iterations, TOLERANCE, (step,), UPDATES).at
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,7 @@ def _descend(
     iterations: int,
     tolerance: float,
     steps: Sequence[float],
+    updates: int = 0,
 ) -> _Reached:
     """Levenberg-Marquardt from a point within the cube."""
     value = residuals(at[None])[0]
@@ -173,9 +177,21 @@ def _descend(
             trials, values, costs = _best_parts(residuals, parts, at, cost, prior)
             replays += len(trials)
             pick, factors = int(np.argmin(costs)), np.ones(len(trials))
+        before = cost
+        for _ in range(updates):
+            if not costs[pick] < enough:
+                break
+            jacobian = _updated(jacobian, trials[pick] - at, values[pick] - value)
+            at, value, cost = trials[pick], values[pick], costs[pick]
+            damping = float(np.clip(damping * factors[pick], 1e-4, 1e6))
+            enough, factors = cost - tolerance * cost, DAMPINGS
+            trials = _trial_steps(jacobian, value, at, damping * factors, prior)
+            values, costs = _tried(residuals, trials, prior)
+            replays += len(trials)
+            pick = int(np.argmin(costs))
         if costs[pick] < cost:
             at, value, cost = trials[pick], values[pick], costs[pick]
-        if cost < enough:
+        if cost < enough or enough < before - tolerance * before:
             damping = float(np.clip(damping * factors[pick], 1e-4, 1e6))
         elif width + 1 < len(steps):
             width, damping = width + 1, FIRST_DAMPING
@@ -238,6 +254,11 @@ def differences(residuals: Residuals, at: Array, value: Array, width: float) -> 
     step = np.where(at + width <= 1.0, width, -width)
     moved = at + np.diag(step)
     return np.asarray(((residuals(moved) - value) / step[:, None]).T)
+
+
+def _updated(jacobian: Array, step: Array, change: Array) -> Array:
+    """A Jacobian after a step, by Broyden: right along it, as before across it."""
+    return np.asarray(jacobian + np.outer(change - jacobian @ step, step) / (step @ step))
 
 
 def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, prior: _Prior) -> Array:

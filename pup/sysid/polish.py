@@ -20,11 +20,11 @@ Errors = Callable[[Array], tuple[Array, NDArray[np.int64]]]
 
 STEP = 0.002
 """Finite-difference step on the unit cube: a coarser one misses the turns of sharp valleys."""
-SQUARES = 10
+SQUARES = 5
 """Iterations of plain least squares: equal weights lead along a valley, unequal ones hold there."""
-ROUNDS = 6
+ROUNDS = 5
 """Times the weights are renewed, at most."""
-ITERATIONS = 3
+ITERATIONS = 2
 """Iterations under the same weights."""
 GAIN = 2e-4
 """A round that lowers the objective by less than this share is the last."""
