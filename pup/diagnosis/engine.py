@@ -16,7 +16,7 @@ from pup.diagnosis.experiment import (
     recorded_besides,
     rivals_of,
 )
-from pup.diagnosis.fitting import Fit, differentiate, fit_together
+from pup.diagnosis.fitting import Fit, complete, differentiate, fit_together
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
@@ -222,8 +222,7 @@ def _weighed(
         return nominal, done
     fit = Fit(nominal.fit.coordinates, nominal.fit.at)
     fit_together([fit], replays, noise)
-    if fit.jacobian is None:
-        differentiate([fit], replays, noise)
+    complete([fit], replays, noise)
     certificate = nominal.certificate
     left = certificate.left * fit.chi2 / nominal.fit.chi2
     nominal = Nominal(fit, noise, replace(certificate, left=left))

@@ -170,7 +170,7 @@ def start_best(
 
 def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Give fits the Jacobians they need for a step; those that one promises nothing have ended."""
-    differentiate([fit for fit in fits if fit.jacobian is None], replays, noise)
+    complete(fits, replays, noise)
     differentiate([f for f in fits if f.thorough and f.age > 0 and _ended(f)], replays, noise)
     for fit in fits:
         fit.done = _ended(fit)
@@ -179,6 +179,11 @@ def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
 def _ended(fit: Fit) -> bool:
     """Whether the Jacobian promises no gain that counts."""
     return _promise(fit, _trials(fit)[0]) < fit.least
+
+
+def complete(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Give those fits a Jacobian that have none."""
+    differentiate([fit for fit in fits if fit.jacobian is None], replays, noise)
 
 
 def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import Coordinate, described_at, nominal_coordinate
-from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
+from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.noise import noise_floor
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
@@ -137,8 +137,7 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
         fit_together(fits, replays, noise, iterations=6)
     agreed = _agree(*fits)
     best, second = sorted(fits, key=lambda fit: fit.chi2)
-    if best.jacobian is None:
-        differentiate([best], replays, noise)
+    complete([best], replays, noise)
     recovered, left = _refit_of_itself(best, replays, noise, rng)
     apart, near = second.chi2 - best.chi2, SPARE * len(measured.values)
     if apart < ((OTHER - 1) * best.chi2 if _noise_like(best) else near):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Trace, threshold
-from pup.diagnosis.fitting import Fit, differentiate, fit_together
+from pup.diagnosis.fitting import Fit, complete, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Nominal
@@ -121,8 +121,7 @@ def search_on(
     if known:
         fit = turned.fit(done.model.fit)
         closely([fit], replays, nominal.noise)
-        if fit.jacobian is None:
-            differentiate([fit], replays, nominal.noise)
+        complete([fit], replays, nominal.noise)
     near = done.selector.base is done.model.fit
     latest = turned.traces(done.selector.found, fit)
     around = fit if near else base
@@ -145,8 +144,7 @@ def _searched(
 ) -> Search:
     """The search from a model on, after rounds of other samples and of these."""
     model, rounds = selector.run(start, known)
-    if model.fit.jacobian is None:
-        differentiate([model.fit], selector.replays, selector.noise)
+    complete([model.fit], selector.replays, selector.noise)
     return Search(selector, model, (*earlier, *rounds), tuple(found), base, selector.enough)
 
 
@@ -170,8 +168,7 @@ def _carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
     fit_together([fit], replays, nominal.noise)
     if fit.chi2 >= nominal.fit.chi2:
         return nominal.fit
-    if fit.jacobian is None:
-        differentiate([fit], replays, nominal.noise)
+    complete([fit], replays, nominal.noise)
     return fit
 
 

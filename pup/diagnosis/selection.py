@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
-from pup.diagnosis.fitting import Fit, differentiate, fit_together, start_best
+from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
@@ -320,7 +320,7 @@ class Selector:
 
     def models(self, fitted: Sequence[Tried]) -> list[Model]:
         """Fitted models with what each fold costs them by fits without it."""
-        differentiate([fit for _, fit in fitted if fit.jacobian is None], self.replays, self.noise)
+        complete([fit for _, fit in fitted], self.replays, self.noise)
         insides = [self.replays.measured.only(fold) for fold in self.folds]
         return [
             Model(
