@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from hardware_agent.virtual import kernels
 from hardware_agent.virtual.character import Character
 from hardware_agent.virtual.skeleton import STEP
 
@@ -28,9 +29,7 @@ COPPER = 0.0039  # resistance of a winding per K
 WINDING, CASE = 4.0, 70.0  # J/K
 AIRED = 0.12  # W/K from the case to the air
 HEAT = 20  # ticks between updates of the temperatures
-BUILT_UP = 20_000.0  # the most that the integral part counts for, ticks x P
 LARGE = 1e12
-FILTER = 0.5  # share of a new sample in the speed that the D gain sees
 
 
 @dataclass
@@ -124,7 +123,8 @@ class Drives:
         motors = [character.motors for character in self.characters]
 
         def each(name: str) -> Array:
-            return np.array([np.atleast_1d(getattr(motor, name)) for motor in motors])
+            told = np.array([np.atleast_1d(getattr(motor, name)) for motor in motors], dtype=float)
+            return np.broadcast_to(told, self.shape).copy()
 
         self.zero = each("bias") / TICK + CENTRE
         self._gain, self._damping = each("gain") * TICK, each("damping") / STEP
@@ -200,7 +200,6 @@ class Drives:
         self._open = EMPTY + (FULL - EMPTY) * self.charge
         self._open -= self._resistance * IDLE * self.joints
         self._shaped = bool(np.isfinite([orders.speed, orders.acceleration]).any())
-        self._integrating = bool(orders.ki.any())
 
     def tick(self, angle: Array, speed: Array) -> Array:
         """One loop of the firmware and the motors.
@@ -212,31 +211,23 @@ class Drives:
         Returns:
           Torques on the links, N m.
         """
-        self._command(self.read(angle))
-        self._gear(speed)
-        self._supply()
-        return self.moving.torque
-
-    def _command(self, ticks: Array) -> None:
-        """The firmware: from ticks to duty."""
-        now = self.moving
+        now, orders = self.moving, self.orders
         if self._shaped:
             self._shape_goal()
         else:
-            np.copyto(now.goal, self.orders.goal)
-        error = now.goal - ticks
-        now.trend += FILTER * (ticks - now.seen - now.trend)
-        now.seen = ticks
-        duty = self._p * error
-        duty -= self._d * now.trend
-        if self._integrating:
-            now.built += STEP * self.orders.ki * error * self.orders.power
-            np.clip(now.built, -BUILT_UP, BUILT_UP, out=now.built)
-            duty += self._gain * now.built
-        np.minimum(duty, self.most, out=duty)
-        np.maximum(duty, -self.most, out=duty)
-        duty *= self.orders.power
-        now.duty = duty
+            np.copyto(now.goal, orders.goal)
+        kernels.command(
+            *(now.duty, now.seen, now.trend, now.built, self.read(angle), now.goal),
+            *(self._p, orders.ki, self._d, self._gain, self.most, orders.power, STEP),
+        )
+        kernels.gear(
+            *(now.drive, now.torque, now.rotor, now.lash, now.bristle, self.drawn),
+            *(now.duty, self.volts, speed, self._strength, self._brake, self._kinetic),
+            *(self._static, self._stribeck, self._loaded, self._viscous, self._grip),
+            *(self._kick, self._play, self._amperes, STEP),
+        )
+        self.volts += SETTLING * (self._open - self._resistance * self.drawn - self.volts)
+        return now.torque
 
     def _shape_goal(self) -> None:
         """Move the goals that the firmware holds at the speed and acceleration asked for."""
@@ -249,42 +240,6 @@ class Drives:
         wanted = np.sign(way) * fastest
         now.pace = np.where(at_once, 0.0, now.pace + np.clip(wanted - now.pace, -change, change))
         now.goal = np.where(at_once, orders.goal, now.goal + STEP * now.pace)
-
-    def _gear(self, speed: Array) -> None:
-        """Motor, friction and play: from duty to the torque on the link."""
-        now, rotor, play = self.moving, self.moving.rotor, self._play
-        now.drive = self._strength * now.duty * self.volts
-        now.drive -= self._brake * rotor
-        level = np.abs(rotor)
-        level *= self._stribeck
-        np.exp(level, out=level)
-        level *= self._static
-        level += self._kinetic
-        level += self._loaded * np.abs(now.torque)
-        bristle = now.bristle
-        bristle += self._grip * rotor
-        np.minimum(bristle, level, out=bristle)
-        np.maximum(bristle, -level, out=bristle)
-        net = now.drive - bristle
-        net -= self._viscous * rotor
-        # A rotor ahead of the link by the whole play can only push it forward, one behind backward.
-        now.torque = np.minimum(net, (now.lash >= play) * LARGE)
-        np.maximum(now.torque, (now.lash <= -play) * -LARGE, out=now.torque)
-        net *= self._kick
-        net += rotor
-        now.rotor = np.where(now.torque == 0.0, net, speed)
-        lash = now.lash
-        lash += STEP * (now.rotor - speed)
-        np.minimum(lash, play, out=lash)
-        np.maximum(lash, -play, out=lash)
-
-    def _supply(self) -> None:
-        """The supply sags under what the servos draw."""
-        now = self.moving
-        power = now.duty * now.drive
-        power *= self._amperes
-        self.drawn = np.add.reduce(power, axis=1, keepdims=True)
-        self.volts += SETTLING * (self._open - self._resistance * self.drawn - self.volts)
 
     def cool(self) -> None:
         """Everything is as warm as the room."""
