@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.noise import assumed_noise, told_anew
-from pup.diagnosis.nominal import Nominal, fit_nominal
+from pup.diagnosis.nominal import Nominal, certified, fit_nominal
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.reweighing import Reweighing
@@ -65,8 +65,8 @@ def test_turned_is_whitened_by_the_other_noise(first: Noise, second: Noise, seed
 
 @pytest.fixture(scope="module")
 def nominal() -> Nominal:
-    replays = bench()
-    return fit_nominal(replays, assumed_noise(replays.measured), np.random.default_rng(0))
+    replays, rng = bench(), np.random.default_rng(0)
+    return certified(fit_nominal(replays, assumed_noise(replays.measured), rng), replays, rng)
 
 
 def weighed(nominal: Nominal, by: Noise) -> Nominal:

@@ -21,7 +21,7 @@ from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.noise import assumed_noise, quiet_noise, told_anew
-from pup.diagnosis.nominal import Nominal, fit_nominal, unfitted
+from pup.diagnosis.nominal import Nominal, certified, fit_nominal, unfitted
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.poor import Poor, why_poor
 from pup.diagnosis.regimes import Regime, regimes
@@ -149,7 +149,9 @@ def diagnose(
     if poor:
         return told("undetermined", poor.reason)
     first = _first_look(nominal, replays, rng, progress, effects)
-    if first is not None:
+    if first is None:
+        nominal = certified(nominal, replays, rng)
+    else:
         nominal = replace(nominal, certificate=first[0].certificate)
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
@@ -254,7 +256,7 @@ def _first_look(
     if not kept:
         return None
     some = replays.narrowed(kept)
-    fitted = fit_nominal(some, assumed_noise(some.measured), rng)
+    fitted = certified(fit_nominal(some, assumed_noise(some.measured), rng), some, rng)
     holds = fitted.certificate.holds
     found = search(some, fitted, rng, progress, most=effects) if holds else None
     replays.simulated += some.simulated

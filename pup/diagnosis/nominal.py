@@ -5,7 +5,7 @@ starts, which must agree, and of a simulation of itself, whose parameters it mus
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,8 @@ class Certificate:
     Attributes:
       starts: chi-squared that the two best starts lead to.
       agree: whether they agree.
-      recovered: largest error of a refit of its own simulation, in standard deviations.
+      recovered: largest error of a refit of its own simulation, in standard deviations; infinite
+        until that is made, see `certified`.
       left: chi-squared by which that refit stops short, and starts that end near each other or near
         the noise: kinks and motions out of step catch a fit. What gains no more is no evidence.
       samples: number of samples.
@@ -70,8 +71,8 @@ class Certificate:
 
     starts: tuple[float, ...]
     agree: bool
-    recovered: float
-    left: float = 0.0
+    recovered: float = np.inf
+    left: float = np.inf
     samples: int = 0
 
     @property
@@ -108,6 +109,8 @@ def free_names(space: ParameterSpace, ground: bool) -> tuple[str, ...]:
 def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nominal:
     """Fit the nominal parameters from several starts, with noise as it then appears.
 
+    Whether the starts agree is told; the rest of the certificate takes longer, see `certified`.
+
     Args:
       replays: simulates.
       first: noise to begin with.
@@ -138,12 +141,24 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     agreed = _agree(*fits)
     best, second = sorted(fits, key=lambda fit: fit.chi2)
     complete([best], replays, noise)
-    recovered, left = _refit_of_itself(best, replays, noise, rng)
-    apart, near = second.chi2 - best.chi2, SPARE * len(measured.values)
-    if apart < ((OTHER - 1) * best.chi2 if _noise_like(best) else near):
+    starts = (best.chi2, second.chi2)
+    return Nominal(best, noise, Certificate(starts, agreed, samples=len(measured.values)))
+
+
+def certified(nominal: Nominal, replays: Replays, rng: np.random.Generator) -> Nominal:
+    """A nominal fit with the whole of its certificate.
+
+    Args:
+      nominal: as `fit_nominal` leaves it.
+      replays: simulates.
+      rng: draws where refits of its own simulation start.
+    """
+    told, fit = nominal.certificate, nominal.fit
+    recovered, left = _refit_of_itself(fit, replays, nominal.noise, rng)
+    apart, near = told.starts[1] - told.starts[0], SPARE * told.samples
+    if apart < ((OTHER - 1) * fit.chi2 if _noise_like(fit) else near):
         left = max(left, apart)
-    starts, samples = (best.chi2, second.chi2), len(measured.values)
-    return Nominal(best, noise, Certificate(starts, agreed, recovered, left, samples))
+    return replace(nominal, certificate=replace(told, recovered=recovered, left=left))
 
 
 def unfitted(replays: Replays, noise: Noise) -> Nominal:
