@@ -30,7 +30,7 @@ PATIENCE = 60.0
 LONGEST = 1 / 3
 """Share of the undisturbed run's time that the job lives at most until it is killed."""
 UNALIKE = frozenset(
-    {"seconds", "processor_seconds", "provenance", "corrected_robot", "model", "video"}
+    {"seconds", "processor_seconds", "provenance", "corrected_robot", "model", "video", "policy"}
     | {"attempt", "recording", "digest", "policy_sha256", "seconds_sampling", "seconds_learning"}
 )
 """What tells of times, places and attempts, or carries their hashes."""

@@ -91,8 +91,12 @@ class Rollout:
         return self._policy.targets(0.0, np.full((1, shape.joints), (shape.bins - 1) / 2))
 
     def time(self, now: float) -> float:
-        """Since the start of the walk, s."""
-        return 0.0 if self._start is None else now - self._start
+        """Since the start of the walk, s.
+
+        To the nanosecond: what rounding leaves of a difference tells when the walk began, and
+        targets would differ by it.
+        """
+        return 0.0 if self._start is None else round(now - self._start, 9)
 
     def target(self, senses: Senses) -> Array:
         """What the policy wants of a tick, rad, shape (n_joints,)."""

@@ -73,7 +73,6 @@ class Runner:
     def _verb(self, command: list[str], log: IO[str]) -> int:
         mark = mkdtemp(prefix="pup-job-")
         watch = reaper.start(mark)  # outlives a kill of this process, and ends what is left
-        assert watch.stdin is not None
         try:
             child = subprocess.Popen(
                 [sys.executable, "-m", "services.cli", *command],
@@ -84,8 +83,7 @@ class Runner:
             )
             code = self._follow(child)
         finally:
-            watch.stdin.close()
-            watch.wait()
+            reaper.close(watch)
         return code if code >= 0 else 128 - code
 
     def _follow(self, child: "subprocess.Popen[bytes]") -> int:

@@ -126,10 +126,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
             for name in ("agent", "robot", "gateway"):
                 self._end(name)
         finally:
-            assert self._watch.stdin is not None
-            self._watch.stdin.close()  # what is left now is killed
-            self._watch.wait()
-            os.environ.pop(reaper.SESSION, None)
+            reaper.close(self._watch)  # what is left now is killed
             shutil.rmtree(self.keys, ignore_errors=True)
 
     @property

@@ -104,7 +104,6 @@ def _probe(address: str) -> None:
 def _embedded(cores: int | None) -> Iterator[None]:
     folder = mkdtemp(prefix="pup-ray-")
     watch = reaper.start(folder)
-    assert watch.stdin is not None
     try:
         with _own_signals(), _loopback():
             ray.init(
@@ -120,9 +119,7 @@ def _embedded(cores: int | None) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
-        watch.stdin.close()
-        watch.wait()
-        os.environ.pop(reaper.SESSION, None)
+        reaper.close(watch)
 
 
 @contextmanager

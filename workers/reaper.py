@@ -18,6 +18,8 @@ from pathlib import Path
 
 SESSION = "PUP_SESSION"
 """Environment variable that marks the processes of one owner."""
+ALIVE = b"alive"
+"""What an owner says that ends its processes and goes on; one that is killed says nothing."""
 
 
 def start(folder: str) -> "subprocess.Popen[bytes]":
@@ -44,20 +46,24 @@ def marked(mark: str) -> list[int]:
     return found
 
 
-def end(mark: str, spared: int | None = None, tries: int = 50) -> bool:
+def end(mark: str, spared: int | None = None, tries: int = 50, calm: int = 1) -> bool:
     """Kill the processes that have a mark, and those that they start meanwhile.
 
     Args:
       mark: as in `marked`.
       spared: a process that has it and goes on.
       tries: a tenth of a second each.
+      calm: times in a row that none may be seen. One that is being started has no environment for
+        a moment, and on a busy machine for longer.
 
     Returns:
       Whether none is left.
     """
+    quiet = 0
     for _ in range(tries):
         left = [pid for pid in marked(mark) if pid != spared]
-        if not left:
+        quiet = 0 if left else quiet + 1
+        if quiet == calm:
             return True
         for pid in left:
             with suppress(ProcessLookupError):
@@ -66,9 +72,18 @@ def end(mark: str, spared: int | None = None, tries: int = 50) -> bool:
     return False
 
 
+def close(watch: "subprocess.Popen[bytes]") -> None:
+    """Set the watching process off from an owner that goes on, and wait for it."""
+    watch.communicate(ALIVE)
+    os.environ.pop(SESSION, None)
+
+
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray sends it to all processes of a stopped job
-    sys.stdin.buffer.read()
+    told = sys.stdin.buffer.read()
     _, session, owner = sys.argv
-    end(f"{SESSION}={session}", spared=int(owner))  # it may have only disconnected
+    if told == ALIVE:  # it has only disconnected, and waits
+        end(f"{SESSION}={session}", spared=int(owner))
+    else:
+        end(f"{SESSION}={session}", tries=100, calm=20)
     shutil.rmtree(session, ignore_errors=True)

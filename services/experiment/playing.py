@@ -6,7 +6,6 @@ by tick as in a trial. Only the agent's daemon is left out, which takes walks al
 """
 
 import math
-import os
 import shutil
 import subprocess
 import sys
@@ -83,7 +82,6 @@ def virtual_robot(robot: RobotDescription, seed: int, log: Path) -> Iterator[Doo
     """
     folder = Path(mkdtemp(prefix="pup-rec-"))  # short: sockets have short names
     watch = reaper.start(str(folder))
-    assert watch.stdin is not None
     try:
         doors = Doors(folder / "link", folder / "imu", folder / "side")
         told = ["--robot", str(robot.folder.absolute()), "--seed", str(seed), "--speed", "0"]
@@ -103,9 +101,7 @@ def virtual_robot(robot: RobotDescription, seed: int, log: Path) -> Iterator[Doo
             process.terminate()
             process.wait()
     finally:
-        watch.stdin.close()  # what is left now is killed
-        watch.wait()
-        os.environ.pop(reaper.SESSION, None)
+        reaper.close(watch)  # what is left now is killed
         shutil.rmtree(folder, ignore_errors=True)
 
 
