@@ -1,5 +1,6 @@
 """When a robot is on its own feet, so that a large tilt is a fall."""
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,21 @@ def rollout(tmp_path: Path) -> Rollout:
     bundle(tmp_path / "policies" / "still", standing())
     shelf = Shelf(tmp_path / "policies", DARWIN)
     return Rollout(shelf.load(shelf.policies()[0].sha256), (0.0, 0.0, 0.0), 33)
+
+
+def test_a_walk_is_timed_the_same_whenever_its_agent_started(rollout: Rollout) -> None:
+    """Lock-step adds periods up: what that leaves in the last bits must not be told."""
+
+    def times(idle: int) -> list[float]:
+        again = copy.deepcopy(rollout)
+        ticks = np.cumsum(np.full(idle + 50, 0.031))[idle:]
+        told = []
+        for now in ticks:
+            again.target(senses(float(now), rollout.pose))
+            told.append(again.time(float(now)))
+        return told
+
+    assert times(7) == times(1000) == [round(0.031 * k, 9) for k in range(50)]
 
 
 def test_it_is_from_when_it_stands_ready_until_it_is_taken(rollout: Rollout) -> None:
