@@ -186,8 +186,6 @@ def _document(
 ) -> dict[str, Any]:
     kept = ("number", "purpose", "eta", "state", "attempt", "distance", "time", "reason")
     walks = [{name: t[name] for name in (*kept, "recording", "digest")} for t in study["trials"]]
-    for walk in walks:
-        walk["time"] = walk["time"] and round(walk["time"], 6)
     return {
         "schema": SCHEMA,
         "robot": study["robot"],
