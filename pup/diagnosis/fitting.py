@@ -15,6 +15,7 @@ from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.probing import changes, probed
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
+from pup.sysid.gauss_newton import updated
 
 Array = NDArray[np.float64]
 
@@ -360,9 +361,7 @@ def _go(fit: Fit, to: _Reached, chi2: float) -> None:
         fit.jacobian, fit.age = to.jacobian, 0
     else:
         moved = to.at - fit.at
-        miss = (fit.residual - to.residual) - fit.jacobian @ moved
-        length = float(moved @ moved)
-        if length > 0:  # Broyden's update
-            fit.jacobian = fit.jacobian + np.outer(miss, moved) / length
+        if moved @ moved > 0:
+            fit.jacobian = updated(fit.jacobian, moved, fit.residual - to.residual)
         fit.age += 1
     fit.at, fit.residual, fit.chi2 = to.at, to.residual, chi2

@@ -177,11 +177,11 @@ def _descend(
             trials, values, costs = _best_parts(residuals, parts, at, cost, prior)
             replays += len(trials)
             pick, factors = int(np.argmin(costs)), np.ones(len(trials))
-        before = cost
+        improved = costs[pick] < enough
         for _ in range(updates):
             if not costs[pick] < enough:
                 break
-            jacobian = _updated(jacobian, trials[pick] - at, values[pick] - value)
+            jacobian = updated(jacobian, trials[pick] - at, values[pick] - value)
             at, value, cost = trials[pick], values[pick], costs[pick]
             damping = float(np.clip(damping * factors[pick], 1e-4, 1e6))
             enough, factors = cost - tolerance * cost, DAMPINGS
@@ -191,7 +191,7 @@ def _descend(
             pick = int(np.argmin(costs))
         if costs[pick] < cost:
             at, value, cost = trials[pick], values[pick], costs[pick]
-        if cost < enough or enough < before - tolerance * before:
+        if improved:
             damping = float(np.clip(damping * factors[pick], 1e-4, 1e6))
         elif width + 1 < len(steps):
             width, damping = width + 1, FIRST_DAMPING
@@ -256,8 +256,14 @@ def differences(residuals: Residuals, at: Array, value: Array, width: float) -> 
     return np.asarray(((residuals(moved) - value) / step[:, None]).T)
 
 
-def _updated(jacobian: Array, step: Array, change: Array) -> Array:
-    """A Jacobian after a step, by Broyden: right along it, as before across it."""
+def updated(jacobian: Array, step: Array, change: Array) -> Array:
+    """A Jacobian after a step, by Broyden: right along it, as before across it.
+
+    Args:
+      jacobian: shape (n_residuals, n_parameters).
+      step: not zero, shape (n_parameters,).
+      change: of what it is of, shape (n_residuals,).
+    """
     return np.asarray(jacobian + np.outer(change - jacobian @ step, step) / (step @ step))
 
 
