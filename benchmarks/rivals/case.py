@@ -13,7 +13,7 @@ from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.models import Model
 from pup.diagnosis.noise import assumed_noise
-from pup.diagnosis.nominal import Nominal, fit_nominal
+from pup.diagnosis.nominal import Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
@@ -79,7 +79,8 @@ class Case:
         measured = Measured.of(robot, pieces(recordings))
         runner = threads(Bench(measured), 1)
         replays = Replays(measured, robot_space(robot, "pd"), runner, 1)
-        nominal = fit_nominal(replays, assumed_noise(measured), np.random.default_rng(SEED))
+        rng = np.random.default_rng(SEED)
+        nominal = certified(fit_nominal(replays, assumed_noise(measured), rng), replays, rng)
         return cls(robot, replays, nominal)
 
     @property
