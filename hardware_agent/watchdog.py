@@ -18,8 +18,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 
-ON, OFF, READY = b"1", b"0", b"r"
+ON, OFF, READY, ENDED = b"1", b"0", b"r", b"e"
 PERSISTENCE = 2.0  # s, of trying to make the robot limp
 SPACING = 0.004  # s between packets: a servo's answer may have garbled the first
 
@@ -77,7 +78,9 @@ class Watchdog:
             return False
 
     def close(self) -> None:
-        """Let it make sure that the robot is limp, and end."""
+        """Let it make sure that the robot is limp, and end; the bus is given up by now."""
+        with suppress(OSError):  # what is full or gone needs no word
+            self._socket.send(ENDED)
         self._socket.close()
         self._process.wait(timeout=10.0)
 
@@ -103,8 +106,10 @@ def watch(beats: socket.socket, agent: int, timeout: float) -> str:
             select.select([agent], [], [])
             return f"the agent did not tick for {timeout:g} s with torque on, and was killed"
         told = beats.recv(4096)
-        if not told:  # it closed the socket; by ending, or on its way there
+        if not told:  # it closed the socket on its way to its end
             select.select([agent], [], [], 5.0)
+            return "the agent has ended"
+        if told.endswith(ENDED):  # it waits for us
             return "the agent has ended"
         torque = told[-1:] == ON
 

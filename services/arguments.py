@@ -63,10 +63,11 @@ def _run(verb: argparse.ArgumentParser) -> None:
     out(verb, "the results of all stages")
     budget(
         verb,
-        generations=20,
-        subset_generations=30,
+        generations=None,
+        subset_generations=10,
         comparison=False,
         start="the robot's own identified.json, without one the values of robot.toml",
+        usual="8 where it begins at fitted values, else 20",
     )
     verb.add_argument(
         "--effects",
@@ -78,7 +79,7 @@ def _run(verb: argparse.ArgumentParser) -> None:
     )
     later = verb.add_argument_group("what follows, for robots with a gait")
     for name, limits, default, told in (
-        ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 300000"),
+        ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 150000"),
         ("--trials", (0, 1000), None, "walks of a virtual robot, to choose eta by; default: 25"),
         ("--repeats", (0, 100), 5, "walks of the chosen eta and of the fitted one; default: 5"),
     ):

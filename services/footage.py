@@ -21,6 +21,7 @@ from pup.locomotion.task import WalkingTask
 from pup.physics.model import FLOOR, compile_model
 from pup.robot import RobotDescription
 from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, drawing_style, new_figure
+from services import stopping
 
 Array = NDArray[np.float64]
 Frames = Iterator[NDArray[np.uint8]]
@@ -178,10 +179,17 @@ def film(stem: Path, robot: RobotDescription, footage: Footage) -> tuple[Path, s
     write, ending = (_mp4, ".mp4") if find_spec("imageio_ffmpeg") else (_gif, ".gif")
     file = stem.with_suffix(ending)
     with suppress(ImportError, AttributeError, RuntimeError, mujoco.FatalError):  # no EGL here
-        write(file, _rendered(scene), rate)
+        write(file, _watched(_rendered(scene)), rate)
         return file, "mujoco"
-    write(file, _drawn(scene), rate)
+    write(file, _watched(_drawn(scene)), rate)
     return file, "matplotlib"
+
+
+def _watched(frames: Frames) -> Frames:
+    """Frames until the job shall stop, also where it is another thread that was told so."""
+    for frame in frames:
+        stopping.check()
+        yield frame
 
 
 def _rendered(scene: _Scene) -> Frames:

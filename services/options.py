@@ -75,28 +75,28 @@ def seed(to: Any, more: str = "") -> None:
 
 def budget(
     verb: argparse.ArgumentParser,
-    generations: int,
+    generations: int | None,
     subset_generations: int,
     comparison: bool,
     start: str = "values of robot.toml",
+    usual: str = "%(default)s",
 ) -> None:
-    """How much pre-sysID does; `start` tells where it begins unless told otherwise."""
+    """How much pre-sysID does, and in words where it begins and its `usual` generations."""
     budget = verb.add_argument_group("what is fitted, and how long")
     actuator(budget)
     for name, limits, default, told in (
-        ("--generations", (1, 100_000), generations, "of each nominal fit"),
-        ("--population", (4, 4096), 16, "candidates per generation"),
-        ("--subsets", (1, 1000), 10, "random subsets of the recordings for the bounds"),
-        ("--subset-generations", (1, 100_000), subset_generations, "of each subset's fit"),
-        ("--folds", (0, 100), 0, "leave-recordings-out fits for a held-out error, 0 for none"),
+        ("--generations", (1, 100_000), generations, f"of each nominal fit; default: {usual}"),
+        ("--population", (4, 4096), 16, "candidates per generation; default: %(default)s"),
+        ("--subsets", (1, 1000), 10, "random subsets for the bounds; default: %(default)s"),
+        (
+            "--subset-generations",
+            (1, 100_000),
+            subset_generations,
+            "of each subset's fit; default: %(default)s",
+        ),
+        ("--folds", (0, 100), 0, "leave-recordings-out fits for a held-out error; default: none"),
     ):
-        budget.add_argument(
-            name,
-            type=number(*limits),
-            default=default,
-            metavar="N",
-            help=f"{told}; default: %(default)s",
-        )
+        budget.add_argument(name, type=number(*limits), default=default, metavar="N", help=told)
     budget.add_argument(
         "--fraction",
         type=number(0.0, 1.0, float),

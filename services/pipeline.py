@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,6 +23,8 @@ from services.stages import Journal, Stage, content
 POLICIES = "policies"
 """Folder of a built-in robot with a bundle for each direction."""
 DIRECTION = "forward"
+ORDER = "presysid", "replay", "train", "walk", "transfer"
+"""Of a half's stages where they are told of."""
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
 FURTHER_RATE = 2e-4
 """Adam's, where a policy that walks is trained further: the usual one would undo its gait."""
@@ -108,20 +111,30 @@ class _Job:
         return self.documents | {"left_out": self.left_out, "took": took}
 
     def _do_half(self, half: Half) -> None:
-        for make in (self._presysid, self._replay, self._train, self._walk, self._transfer):
-            if stage := make(half):
-                self._do(stage)
+        """The stages of a half; pictures are drawn while the trials leave a core without work."""
+        done: dict[str, Any] = {}
+        for make in (self._presysid, self._train):
+            self._do(make(half), done)
+        with ThreadPoolExecutor(1) as aside:
+            shown = (self._replay, self._walk)
+            drawn = [aside.submit(self._do, make(half), done) for make in shown]
+            self._do(self._transfer(half), done)
+            for picture in drawn:
+                picture.result()
+        self.documents |= {name: done[name] for name in map(half.stage, ORDER) if name in done}
 
-    def _do(self, stage: Stage) -> None:
+    def _do(self, stage: Stage | None, done: dict[str, Any]) -> None:
+        if stage is None:
+            return
         self.journal.once(stage)
-        self.documents[stage.name] = content(self.out, stage.files[0])
+        done[stage.name] = content(self.out, stage.files[0])
 
     def _corrected(self) -> Half | None:
         """The second half of the job, if the diagnosis found what is to be corrected."""
         if not self.mission.effects:
             self.left_out[DIAGNOSIS] = "as told"
             return None
-        self._do(self._diagnosis())
+        self._do(self._diagnosis(), self.documents)
         told = self.documents[DIAGNOSIS]
         if not told["findings"]:
             undetermined = f"undetermined: {told['reason']}"

@@ -1,6 +1,7 @@
 """Stages of a job, each done once: `run.json` tells from what, and what came of it."""
 
 import shutil
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -52,7 +53,7 @@ class Done:
 
 
 class Journal:
-    """The steps of a job that are done.
+    """The steps of a job that are done; several may be at work at once.
 
     Args:
       out: folder of the job.
@@ -67,6 +68,7 @@ class Journal:
         if not isinstance(told, dict) or not isinstance(told.get("stages"), dict):
             raise InputError(f"{self.file}: not the journal of a job; use another --out")
         self._told = {"begun": {}} | told
+        self._writing = threading.Lock()
 
     def once(self, stage: Stage) -> None:
         """Do a step, unless it is done from the same inputs and its files are as it left them."""
@@ -77,14 +79,17 @@ class Journal:
         if stage.folder:
             if self._told["begun"].get(stage.name, inputs) != inputs or (same and stage.remade):
                 shutil.rmtree(self.out / stage.folder, ignore_errors=True)
-            self._told["begun"][stage.name] = inputs
-            write_json(self.file, self._told)
+            self._write("begun", stage, inputs)
         begin = time.time()
         stage.work()
         seconds = round(time.time() - begin, 1)
         done = {"inputs": inputs, "seconds": seconds, "files": self._files(stage)}
-        self._told["stages"][stage.name] = done
-        write_json(self.file, self._told)
+        self._write("stages", stage, done)
+
+    def _write(self, part: str, stage: Stage, told: dict[str, Any]) -> None:
+        with self._writing:
+            self._told[part][stage.name] = told
+            write_json(self.file, self._told)
 
     def kept(self, stage: Stage) -> bool:
         """Whether a step is done from the same inputs and its files are as it left them."""

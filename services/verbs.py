@@ -22,16 +22,20 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
     _quiet_torch()
     from pup.recording import load_recordings
     from pup.sysid.accuracy import JointUnits
-    from services.mission import Means, Mission, default_recordings
+    from services.mission import FURTHER, GENERATIONS, Means, Mission, default_recordings
     from services.pipeline import run
     from services.progress import reporter, stages, trained
+    from workers.cluster import staying
 
     robot = RobotDescription.load(options.robot)
     given = options.recordings
     recordings = load_recordings([given], robot) if given else default_recordings(robot)
-    budget = _budget(options, robot)
-    if budget.start is None and _identified(robot) == budget.actuator:
-        budget = replace(budget, start=robot.identified_path)
+    known = options.start
+    if known is None and _identified(robot) == (options.actuator or robot.actuator):
+        known = robot.identified_path
+    if options.generations is None:
+        options.generations = GENERATIONS if known is None else FURTHER
+    budget = replace(_budget(options, robot), start=known)
     mission = Mission(budget, options.train_steps, options.trials, options.repeats, options.effects)
     means = Means(
         lambda: places.fits(options),
@@ -43,7 +47,7 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
         _tell,
         places.cores(options),
     )
-    with _folder(options.out) as out:
+    with _folder(options.out) as out, staying():
         done = run(robot, recordings, mission, out, means)
     return done | {
         "report": str(out / "report.html"),

@@ -248,6 +248,17 @@ def test_killed_or_hung_the_robot_is_limp_soon(tmp_path: Path) -> None:
         assert "did not tick for 0.5 s" in made.log()
 
 
+def test_asked_to_end_it_leaves_the_robot_limp_without_waiting(tmp_path: Path) -> None:
+    with lab(tmp_path, speed=1.0) as made:
+        made.start()
+        made.say("enable")
+        asked = time.monotonic()
+        made.end()
+        assert time.monotonic() - asked < 4  # agent and watchdog waited 5 s for each other once
+        assert limp(made)
+        assert "the agent has ended; torque is off" in made.log()
+
+
 @pytest.mark.slow
 def test_without_its_watchdog_the_agent_lets_go(tmp_path: Path) -> None:
     with lab(tmp_path, speed=1.0) as made:

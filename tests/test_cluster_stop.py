@@ -8,7 +8,7 @@ import time
 import pytest
 import ray
 
-from workers.cluster import connected
+from workers.cluster import connected, staying
 
 
 @pytest.mark.ray
@@ -25,4 +25,16 @@ def test_a_stop_while_ray_starts_is_kept(seconds: float) -> None:
     finally:
         timer.cancel()
         signal.signal(signal.SIGTERM, usual)
+    assert not ray.is_initialized()
+
+
+@pytest.mark.ray
+def test_ray_stays_for_the_jobs_that_follow_and_not_longer() -> None:
+    seen = []
+    with staying():
+        assert not ray.is_initialized()
+        for _ in range(2):
+            with connected(cores=1):
+                seen.append(ray.get_runtime_context().get_node_id())
+    assert seen[0] == seen[1]
     assert not ray.is_initialized()

@@ -12,7 +12,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from tempfile import mkdtemp
 from types import FrameType
 from typing import Any
@@ -36,6 +36,8 @@ RAY_SETTINGS = {
     "RAY_grpc_client_keepalive_timeout_ms": "20000",
 }
 """Of Ray, for all processes of a cluster, in their environment."""
+_staying: ExitStack | None = None
+"""Ends the connection that stays; see `staying`."""
 
 
 @contextmanager
@@ -52,6 +54,33 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
     Raises:
       InputError: there is no cluster at that address.
     """
+    if _staying is None:
+        with _connected(address, cores):
+            yield
+        return
+    if not ray.is_initialized():
+        _staying.enter_context(_connected(address, cores))
+    yield
+
+
+@contextmanager
+def staying() -> Iterator[None]:
+    """Have Ray stay for the jobs that come one after the other, all with the same options.
+
+    The first one to connect starts it: a new Ray, whose processes import everything anew, takes
+    seconds.
+    """
+    global _staying
+    with ExitStack() as stack:
+        _staying = stack
+        try:
+            yield
+        finally:
+            _staying = None
+
+
+@contextmanager
+def _connected(address: str | None, cores: int | None) -> Iterator[None]:
     for name, value in RAY_SETTINGS.items():
         os.environ.setdefault(name, value)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.evidence import Trace, threshold
+from pup.diagnosis.evidence import Projector, Trace, threshold, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
@@ -78,7 +78,10 @@ def search(
     """
     progress("score test", 0.3)
     base = nominal.fit if first is None else _carried(first, replays, nominal)
-    found = traces(hypotheses(replays.measured), base, replays, nominal.noise)
+    if first is not None and base is not nominal.fit and first.selector.full(first.model):
+        found = _seen_first(first, base, replays)  # nothing more is looked for
+    else:
+        found = traces(hypotheses(replays.measured), base, replays, nominal.noise)
     if not found:
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
@@ -170,6 +173,21 @@ def _carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
         return nominal.fit
     complete([fit], replays, nominal.noise)
     return fit
+
+
+def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
+    """Traces of a first look, as if the motions that it left out showed nothing."""
+    measured = replays.measured
+    looked = {recording.id for recording in first.selector.replays.measured.recordings}
+    inside = measured.only([i for i, r in enumerate(measured.recordings) if r.id in looked])
+    project = Projector(base.slopes)
+
+    def widened(trace: Trace) -> Trace | None:
+        whole = np.zeros((len(inside), trace.whole.shape[1]))
+        whole[inside] = trace.whole
+        return traced(trace.hypothesis, whole, project)
+
+    return [trace for trace in map(widened, first.found) if trace is not None]
 
 
 def followed(nominal: Nominal, replays: Replays) -> list[int]:

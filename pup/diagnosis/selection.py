@@ -111,9 +111,14 @@ class Selector:
             model = swap.finalists[0]
         return self._without(model), rounds
 
+    def full(self, model: Model) -> bool:
+        """Whether a model has as many effects as are looked for, or at as many places."""
+        known = model.hypotheses
+        return len(known) >= PLACES or len(_effects(known)) >= self.most
+
     def _added(self, model: Model, rounds: list[Round]) -> Model:
         """The model with effects added as long as one holds; notes the rounds."""
-        while len(model.hypotheses) < PLACES and len(_effects(model.hypotheses)) < self.most:
+        while not self.full(model):
             chosen = self._round(model)
             if chosen is None:
                 break
