@@ -1,7 +1,7 @@
 """A whole job that is killed again and again ends as one that nobody disturbed.
 
 `pup run` runs once undisturbed. Then the same runs in another folder and is killed (SIGKILL) after
-times drawn evenly up to a third of what the first one took; after each kill no process of it may
+times drawn evenly up to a fifth of what the first one took; after each kill no process of it may
 be left. At the end all that both found is compared, to the last bit.
 
     python -m benchmarks.kills --kills 10 --out kills -- --trials 6 --repeats 2
@@ -27,7 +27,7 @@ from workers import reaper
 
 PATIENCE = 60.0
 """For the processes of a killed job to end, s; the machine may be busy."""
-LONGEST = 1 / 3
+LONGEST = 1 / 5
 """Share of the undisturbed run's time that the job lives at most until it is killed."""
 UNALIKE = frozenset(
     {"seconds", "processor_seconds", "provenance", "corrected_robot", "model", "video", "policy"}
