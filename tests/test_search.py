@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.noise import assumed_noise
-from pup.diagnosis.nominal import Certificate, Nominal
+from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.search import followed
+from pup.diagnosis.search import followed, search
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
+from tests.blind_sets import FRICTION
 from tests.diagnosis_cases import BENCH, recordings
 
 
@@ -102,3 +103,24 @@ def test_a_motion_that_gets_lost_comes_second(runs: tuple[Recording, ...]) -> No
 def test_where_too_few_are_left_all_are_taken(runs: tuple[Recording, ...]) -> None:
     lost = [replace(run, position=run.position + 1.0) for run in runs[2:]]
     assert kept((*runs[:2], *lost)) == []
+
+
+def test_where_nothing_more_is_looked_for_a_first_look_is_not_scored_again() -> None:
+    """With all motions its model is fitted, and its traces stand for those of all."""
+    measured = Measured.of(BENCH, recordings(FRICTION))
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    rng = np.random.default_rng(0)
+    nominal = certified(fit_nominal(replays, assumed_noise(measured), rng), replays, rng)
+    some = replays.narrowed([0, 1, 2, 3])
+    fitted = certified(fit_nominal(some, assumed_noise(some.measured), rng), some, rng)
+    first = search(some, fitted, rng, lambda stage, share: None, most=1)
+    assert first is not None and first.model.hypotheses[0].effect == "coulomb_friction"
+    spent = []
+    for most in (1, 8):
+        begun = replays.simulated
+        done = search(replays, nominal, rng, lambda stage, share: None, first, most)
+        assert done is not None and done.model.hypotheses[0].effect == "coulomb_friction"
+        assert {len(trace.whole) for trace in done.found} == {len(measured.values)}
+        assert done.enough == pytest.approx(first.enough, rel=0.3)
+        spent.append(replays.simulated - begun)
+    assert spent[0] < spent[1] / 2

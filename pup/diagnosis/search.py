@@ -20,7 +20,7 @@ from pup.diagnosis.nominal import Nominal
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
-from pup.diagnosis.selection import Selector
+from pup.diagnosis.selection import Selector, full
 from pup.diagnosis.starts import closely
 from pup.diagnosis.tracing import traces
 from pup.physics.terms.scale import Scale
@@ -78,7 +78,7 @@ def search(
     """
     progress("score test", 0.3)
     base = nominal.fit if first is None else _carried(first, replays, nominal)
-    if first is not None and base is not nominal.fit and first.selector.full(first.model):
+    if first is not None and base is not nominal.fit and full(first.model, most):
         found = _seen_first(first, base, replays)  # nothing more is looked for
     else:
         found = traces(hypotheses(replays.measured), base, replays, nominal.noise)

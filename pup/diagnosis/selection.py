@@ -111,14 +111,9 @@ class Selector:
             model = swap.finalists[0]
         return self._without(model), rounds
 
-    def full(self, model: Model) -> bool:
-        """Whether a model has as many effects as are looked for, or at as many places."""
-        known = model.hypotheses
-        return len(known) >= PLACES or len(_effects(known)) >= self.most
-
     def _added(self, model: Model, rounds: list[Round]) -> Model:
         """The model with effects added as long as one holds; notes the rounds."""
-        while not self.full(model):
+        while not full(model, self.most):
             chosen = self._round(model)
             if chosen is None:
                 break
@@ -352,6 +347,11 @@ class Selector:
         for inside, simulated in zip(insides, told, strict=True):
             predicted[inside] = np.where(np.isnan(simulated[0]), LOST, simulated[0])
         return replace(model, predicted=predicted, refits=np.array([fit.at for fit in fits]))
+
+
+def full(model: Model, most: int) -> bool:
+    """Whether a model has as many effects as are looked for, or at as many places as can be."""
+    return len(model.hypotheses) >= PLACES or len(_effects(model.hypotheses)) >= most
 
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
