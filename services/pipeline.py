@@ -1,6 +1,8 @@
 """`pup run`: the whole job, stage by stage, each a call a user could make alone."""
 
 import json
+import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -115,7 +117,7 @@ class _Job:
         done: dict[str, Any] = {}
         for make in (self._presysid, self._train):
             self._do(make(half), done)
-        with ThreadPoolExecutor(1) as aside:
+        with ThreadPoolExecutor(1, initializer=_step_back) as aside:
             shown = (self._replay, self._walk)
             drawn = [aside.submit(self._do, make(half), done) for make in shown]
             self._do(self._transfer(half), done)
@@ -322,6 +324,14 @@ class _Job:
 
     def _hash(self, *names: str) -> dict[str, str]:
         return {name: sha256(self.out / name) for name in names}
+
+
+def _step_back() -> None:
+    """Have a thread, and those that it starts, take what others leave of the cores.
+
+    A trial is a chain of short steps of several processes, each of which would wait for a picture.
+    """
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
 
 
 def _half(generations: int) -> int:
