@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Shares = Callable[[Array], Array]
 """Candidates (n, k) on the unit cube to each recording's share, shape (n, n_recordings)."""
 
-ROUNDS = (3, 9)
+ROUNDS = (3, 6)
 """Replays per coefficient of the surface: of a rough one that tells in which directions to look how
 far, and of the one that counts; replays of the first count again where the second looks too."""
 SCALES = 2.0 ** np.arange(4, -8, -1)
