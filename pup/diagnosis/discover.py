@@ -20,6 +20,7 @@ from pup.diagnosis.models import Model
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import KEPT, Selector
+from pup.diagnosis.starts import closely
 from pup.diagnosis.verdict import (
     UNKNOWN,
     Finding,
@@ -43,9 +44,8 @@ MATERIAL = 0.09
 """Mean square of a channel's unexplained errors, in that of its noise, that matters."""
 FORM = 0.05
 """Share of its own trace that a wrong form of a known effect may leave."""
-ROUGH, LAST = 5, 14
-"""Steps of the refits of all laws until they are compared, and of the best: they may start far from
-where they end."""
+ROUGH = 5
+"""Steps of all laws' refits until they are compared: they may start far from where they end."""
 CLOSE = 3
 """So many of them are refitted to the end."""
 TRIED = 2
@@ -203,9 +203,7 @@ def _refitted(
     fit_together([fit for _, fit in fits], selector.replays, selector.noise, iterations=ROUGH)
     fits.sort(key=lambda told: told[1].chi2 + told[0].price * len(told[0].features))
     close = [fit for _, fit in fits[:CLOSE]]
-    for fit in close:
-        fit.thorough, fit.done, fit.jacobian = True, False, None
-    fit_together(close, selector.replays, selector.noise, iterations=LAST)
+    closely(close, selector.replays, selector.noise)
     return fits[:CLOSE]
 
 

@@ -26,7 +26,7 @@ ROUNDS = 5
 """Times the weights are renewed, at most."""
 ITERATIONS = 2
 """Iterations under the same weights."""
-GAIN = 2e-4
+GAIN = 1e-3
 """A round that lowers the objective by less than this share is the last."""
 FLOOR = 1e-3
 """Norms below this share of their mean are not weighted any higher."""
