@@ -68,7 +68,7 @@ class Work:
 def main() -> None:
     options = parser(__doc__, rounds=3)
     options.add_argument("--simulations", type=int, default=256)
-    options.add_argument("--length", type=int, default=24)
+    options.add_argument("--length", type=int, default=80)
     given = options.parse_args()
     logging.getLogger("ray").setLevel(logging.ERROR)
     report = Report("training", given.json)
@@ -113,7 +113,7 @@ def _work(given: argparse.Namespace) -> Work:
     shape = PolicyShape.of(Method.PUP, *map(len, names), len(task.joints), task.bins)
     sampling = Sampling(walking, given.simulations, given.length, 0, given.threads)
     mirror = MirrorMap.of(robot, *names, bins=task.bins)
-    return Work(walking, shape, sampling, Learning(mirror=mirror, threads=given.threads))
+    return Work(walking, shape, sampling, Learning(mirror=mirror))
 
 
 def _physics(work: Work) -> Callable[[], object]:
