@@ -83,7 +83,7 @@ class Runner:
             )
             code = self._follow(child)
         finally:
-            reaper.close(watch)
+            reaper.close(watch, mark)
         return code if code >= 0 else 128 - code
 
     def _follow(self, child: "subprocess.Popen[bytes]") -> int:

@@ -109,7 +109,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
 
     def __enter__(self) -> "Laboratory":
         self._passing = Path(mkdtemp(prefix="pup-lab-"))  # short: sockets have short names
-        self._watch = reaper.start(str(self._passing))
+        self._watch = reaper.watch(str(self._passing))
         try:
             self._open()
         except BaseException:
@@ -126,7 +126,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
             for name in ("agent", "robot", "gateway"):
                 self._end(name)
         finally:
-            reaper.close(self._watch)  # what is left now is killed
+            reaper.close(self._watch, str(self._passing))  # what is left now is killed
             shutil.rmtree(self.keys, ignore_errors=True)
 
     @property

@@ -48,8 +48,27 @@ def test_an_owner_that_goes_on_is_not_ended_and_its_mark_is_gone(tmp_path: Path)
     folder.mkdir()
     watch = reaper.start(str(folder))
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    reaper.close(watch)
+    reaper.close(watch, str(folder))
     assert watch.returncode == 0
     assert child.wait(5) == -9
     assert not folder.exists()
     assert reaper.SESSION not in os.environ
+
+
+def test_what_is_started_beside_an_owner_that_marks_its_own_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a picture's encoder beside a laboratory, and Ray's mark stays."""
+    monkeypatch.setenv(reaper.SESSION, "another")
+    folder = tmp_path / "session"
+    folder.mkdir()
+    asleep = [sys.executable, "-c", "import time; time.sleep(60)"]
+    watch = reaper.watch(str(folder))
+    beside = subprocess.Popen(asleep)
+    own = subprocess.Popen(asleep, env=os.environ | {reaper.SESSION: str(folder)})
+    reaper.close(watch, str(folder))
+    assert own.wait(5) == -9
+    assert beside.poll() is None
+    assert os.environ[reaper.SESSION] == "another"
+    beside.kill()
+    beside.wait()

@@ -148,7 +148,7 @@ def _embedded(cores: int | None) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
-        reaper.close(watch)
+        reaper.close(watch, folder)
 
 
 @contextmanager

@@ -23,8 +23,16 @@ ALIVE = b"alive"
 
 
 def start(folder: str) -> "subprocess.Popen[bytes]":
-    """Start the watching process; closing its standard input, or dying, sets it off."""
+    """Mark all that this process starts from now on, and start the watching process."""
     os.environ[SESSION] = folder
+    return watch(folder)
+
+
+def watch(folder: str) -> "subprocess.Popen[bytes]":
+    """Start the watching process; closing its standard input, or dying, sets it off.
+
+    For an owner that marks its processes itself: this one may start others meanwhile.
+    """
     unmarked = {k: v for k, v in os.environ.items() if k != SESSION}
     return subprocess.Popen(
         [sys.executable, "-m", "workers.reaper", folder, str(os.getpid())],
@@ -72,10 +80,11 @@ def end(mark: str, spared: int | None = None, tries: int = 50, calm: int = 1) ->
     return False
 
 
-def close(watch: "subprocess.Popen[bytes]") -> None:
+def close(watching: "subprocess.Popen[bytes]", folder: str) -> None:
     """Set the watching process off from an owner that goes on, and wait for it."""
-    watch.communicate(ALIVE)
-    os.environ.pop(SESSION, None)
+    watching.communicate(ALIVE)
+    if os.environ.get(SESSION) == folder:
+        del os.environ[SESSION]
 
 
 if __name__ == "__main__":

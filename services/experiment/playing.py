@@ -101,7 +101,7 @@ def virtual_robot(robot: RobotDescription, seed: int, log: Path) -> Iterator[Doo
             process.terminate()
             process.wait()
     finally:
-        reaper.close(watch)  # what is left now is killed
+        reaper.close(watch, str(folder))  # what is left now is killed
         shutil.rmtree(folder, ignore_errors=True)
 
 
