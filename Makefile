@@ -12,12 +12,12 @@ ROBOT ?= darwin_op2
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[service,learn]'
 	touch $@
 
-# Tests need the engine on JAX too.
+# Tests need their tools, and the engine on JAX too.
 $(VENV)/.tested: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[brax]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,brax]'
 	touch $@
 
 IMPORTED := $(if $(FORMAT),$(OUT)/recordings,$(RECORDINGS))
@@ -26,20 +26,20 @@ run: $(VENV)/.installed
 	$(if $(FORMAT),$(BIN)/pup import $(FORMAT) $(RECORDINGS) --robot $(ROBOT) --out $(IMPORTED))
 	$(BIN)/pup run --out $(OUT) --robot $(ROBOT) $(if $(RECORDINGS),--recordings $(IMPORTED)) $(ARGS)
 
-lint: $(VENV)/.installed
+lint: $(VENV)/.tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 # Two processes: fixtures of a file are made once, and no test runs in the one whose exit counts.
-test: lint $(VENV)/.tested
+test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 slow: $(VENV)/.tested
 	$(BIN)/python -m pytest -m slow
 
-docs: $(VENV)/.installed
+docs: $(VENV)/.tested
 	$(BIN)/mkdocs build --strict
 
 clean:

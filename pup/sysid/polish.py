@@ -22,6 +22,8 @@ STEP = 0.002
 """Finite-difference step on the unit cube: a coarser one misses the turns of sharp valleys."""
 SQUARES = 5
 """Iterations of plain least squares: equal weights lead along a valley, unequal ones hold there."""
+ANCHORED = 2
+"""The same where the start is near the anchor, at which a fit of more recordings ended."""
 ROUNDS = 5
 """Times the weights are renewed, at most."""
 ITERATIONS = 2
@@ -43,7 +45,8 @@ def polish(errors: Errors, start: Array, anchor: Array | None = None) -> Array:
     Returns:
       A point on the unit cube whose objective is not higher than the start's.
     """
-    at = _squares(errors, start, anchor, SQUARES, equal=True)
+    squares = SQUARES if anchor is None else ANCHORED
+    at = _squares(errors, start, anchor, squares, equal=True)
     objective = _objective(errors, at, anchor)
     for _ in range(ROUNDS):
         reached = _squares(errors, at, anchor, ITERATIONS, equal=False)
