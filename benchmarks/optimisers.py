@@ -67,7 +67,7 @@ class Recorded:
         return self._best
 
 
-def ours(seed: int, simulated: Any = None) -> Session:
+def ours(seed: int, simulated: Any = None, least_gain: float = 0.0) -> Session:
     from pup.transfer.optimizer import Search, choose, suggest
 
     def search(eta: Array, distance: Array) -> Search:
@@ -77,10 +77,20 @@ def ours(seed: int, simulated: Any = None) -> Session:
     number = 0
     while True:
         number += 1
-        asked = np.array(suggest(search(eta, distance), number).eta)
+        decision = suggest(search(eta, distance), number)
+        if not decision.is_worth(least_gain):
+            break
+        asked = np.array(decision.eta)
         kept = np.array(choose(search(eta, distance)).eta) if number - 1 in LOOKS else None
         walked = yield asked, kept
         eta, distance = np.vstack([eta, asked]), np.append(distance, walked)
+    kept = np.array(choose(search(eta, distance)).eta)
+    while True:
+        yield kept, kept
+
+
+def frugal(seed: int) -> Session:
+    return ours(seed, least_gain=0.002)
 
 
 def warm(seed: int) -> Session:
@@ -152,6 +162,7 @@ def ax(seed: int) -> Session:
 
 RIVALS: dict[str, tuple[Callable[[int], Session], str]] = {
     "pup": (ours, "botorch"),
+    "pup, as long as worth a walk": (frugal, "botorch"),
     "pup, simulated prior": (warm, "botorch"),
     "Ax": (ax, "ax"),
     "Optuna GP": (optuna_gp, "optuna"),
@@ -166,7 +177,7 @@ def regrets(
     rng = np.random.default_rng((seed, 4))
     best, session = robot.optimum(), make(seed)
     found: dict[str, Any] = {}
-    spent = []
+    spent, tried = [], set()
     walked: Any = None
     for walks in range(max(LOOKS) + 1):
         began = time.process_time()
@@ -175,7 +186,10 @@ def regrets(
         if walks in LOOKS:
             assert kept is not None
             found[str(walks)] = 100 * (1 - float(robot.expected(np.asarray(kept))) / best)
+        if walks < max(LOOKS):
+            tried.add(tuple(asked))
         walked = robot.walk(np.asarray(asked), rng)
+    found["tried"] = len(tried)
     return found | {"seconds": float(np.quantile(spent[6:], 0.95))}
 
 
@@ -223,6 +237,7 @@ def main() -> None:
                 "median": float(np.median(found)),
                 "each": found.tolist(),
             }
+        row["etas_tried"] = float(np.mean([r["tried"] for r in runs]))
         row["seconds_p95"] = float(np.median([r["seconds"] for r in runs]))
         table[name] = row
         told = "; ".join(
@@ -230,6 +245,7 @@ def main() -> None:
             f"{row[look]['median']:.1f})"
             for look in map(str, LOOKS)
         )
+        told += f"; {row['etas_tried']:.1f} etas tried"
         print(f"{name}: {told}; suggestion p95 {row['seconds_p95']:.2f} s", flush=True)
         if options.out:
             document = {

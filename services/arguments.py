@@ -78,17 +78,20 @@ def _run(verb: argparse.ArgumentParser) -> None:
         "with the robot as it was found to be; default: 2, 0 leaves that out",
     )
     later = verb.add_argument_group("what follows, for robots with a gait")
-    for name, limits, default, told in (
-        ("--train-steps", (0, 10**11), None, "of training, on Ray in any case; default: 150000"),
-        ("--trials", (0, 1000), None, "walks of a virtual robot, to choose eta by; default: 25"),
-        ("--repeats", (0, 100), 5, "walks of the chosen eta and of the fitted one; default: 5"),
-    ):
-        later.add_argument(
-            name,
-            type=number(*limits),
-            default=default,
-            metavar="N",
-            help=told if name == "--repeats" else f"{told}, 0 leaves it out",
-        )
+    for name, most, default, told in (
+        ("--train-steps", 10**11, None, "of training, on Ray in any case; default: 150000, 0 none"),
+        ("--trials", 1000, None, "walks of a virtual robot at most, to choose eta by; default: 25, "
+         "0 leaves them out"),
+        ("--repeats", 100, 5, "walks of the chosen eta and of the fitted one; default: 5"),
+    ):  # fmt: skip
+        later.add_argument(name, type=number(0, most), default=default, metavar="N", help=told)
+    later.add_argument(
+        "--least-gain",
+        type=number(0.0, 0.99, float),
+        default=0.002,
+        metavar="X",
+        help="expected of a further walk, as a share of the best eta's distance, below which eta "
+        "is chosen; default: %(default)s, 0 makes all --trials",
+    )
     verb.set_defaults(runners=0)
     place(verb)

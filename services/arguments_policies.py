@@ -154,6 +154,7 @@ def transfer(verb: argparse.ArgumentParser) -> None:
     for name, limits, kind, told in (
         ("--trials", (1, 1000), int, "walks until eta is chosen (25)"),
         ("--initial", (1, 1000), int, "uniform ones among them (5)"),
+        ("--least-gain", (0.0, 0.99), float, "expected of a walk, of the best's distance (0)"),
         ("--repeats", (0, 100), int, "walks of the chosen eta, and of each compared one (5)"),
         ("--horizon", (0.1, 600.0), float, "longest walk, s (15)"),
         ("--lease", (1.0, 86400.0), float, "silence after which a trial is lost, s (120)"),

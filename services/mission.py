@@ -21,7 +21,10 @@ neighbourhood CMA-ES has searched by then, and the polish does the rest."""
 STEPS = 150_000
 """Of the training unless told otherwise: three quarters of a minute at 3,700 a second."""
 TRIALS = 25
-"""Walks until eta is chosen (paper)."""
+"""Walks until eta is chosen, at most (paper)."""
+LEAST_GAIN = 0.002
+"""Expected of a further walk, as a share of the best's distance: less than walks of one eta differ
+by, and made-up landscapes are searched as well with it (docs/results/transfer.md)."""
 EFFECTS = 2
 """Missing effects unless told otherwise: a robot of twenty joints takes minutes for each."""
 
@@ -33,8 +36,9 @@ class Mission:
     Attributes:
       presysid: budget of its fits.
       steps: of each training; 0 leaves it out; None for STEPS where the robot has a gait.
-      trials: walks until eta is chosen; 0 leaves them out; None for TRIALS where the robot has a
-        gait and servos.
+      trials: walks until eta is chosen, at most; 0 leaves them out; None for TRIALS where the
+        robot has a gait and servos.
+      least_gain: that is expected of a further walk, as a share of the best's distance.
       repeats: walks of the chosen eta and of the fitted one.
       effects: missing ones that recordings and walks are searched for, to do all of it again with
         the robot as it was found to be; 0 leaves that out.
@@ -43,6 +47,7 @@ class Mission:
     presysid: Options
     steps: int | None = None
     trials: int | None = None
+    least_gain: float = LEAST_GAIN
     repeats: int = 5
     effects: int = EFFECTS
 

@@ -221,7 +221,8 @@ class _Job:
             return None
         from services.trials import Budget, try_out
 
-        budget = Budget(self.trials, self.mission.repeats, self.mission.presysid.seed)
+        mission, seed = self.mission, self.mission.presysid.seed
+        budget = Budget(self.trials, mission.least_gain, mission.repeats, seed)
         policy = self.out / half.at(POLICY) if self.steps else self.shipped
         bounds, out = self.out / half.at(BOUNDS), self.out / half.at("transfer")
 

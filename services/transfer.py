@@ -209,8 +209,8 @@ def read_simulated(file: Path) -> dict[str, Any]:
 
 def settings_of(options: Any) -> dict[str, Any]:
     """Settings of a study from the command line; what was not given is the gateway's default."""
-    names = ("trials", "initial", "repeats", "horizon", "lease", "failures", "agent", "seed")
-    told = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    names = ("trials", "initial", "least_gain", "repeats", "horizon", "lease", "failures", "agent")
+    told = {n: getattr(options, n) for n in (*names, "seed") if getattr(options, n) is not None}
     told["gate"] = (Gate.AUTO if options.auto else Gate.OPERATOR).value
     if options.auto:
         told.setdefault("failures", 3)

@@ -35,13 +35,15 @@ class Budget:
     """How many walks are made.
 
     Attributes:
-      trials: until eta is chosen (paper: 25).
+      trials: until eta is chosen, at most (paper: 25).
+      least_gain: that is expected of a further one, as a share of the best's distance.
       repeats: of the chosen eta afterwards, and of the fitted one (paper: 5).
       seed: of the search.
       horizon: the longest walk, s.
     """
 
     trials: int = StudySettings.trials
+    least_gain: float = StudySettings.least_gain
     repeats: int = StudySettings.repeats
     seed: int = 0
     horizon: float = StudySettings.horizon
@@ -111,6 +113,7 @@ def follow(
     settings = {
         "trials": budget.trials,
         "initial": min(StudySettings.initial, budget.trials),
+        "least_gain": budget.least_gain,
         "repeats": budget.repeats,
         "compare": [list(eta) for eta in compare],
         "horizon": budget.horizon,

@@ -36,7 +36,14 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
     if options.generations is None:
         options.generations = GENERATIONS if known is None else FURTHER
     budget = replace(_budget(options, robot), start=known)
-    mission = Mission(budget, options.train_steps, options.trials, options.repeats, options.effects)
+    mission = Mission(
+        budget,
+        options.train_steps,
+        options.trials,
+        options.least_gain,
+        options.repeats,
+        options.effects,
+    )
     means = Means(
         lambda: places.fits(options),
         lambda: places.replays(options),

@@ -71,6 +71,16 @@ def test_a_study_is_followed_to_its_end(robot, tmp_path):
     assert other.code == 2 and "other settings" in other.err
 
 
+def test_a_search_ends_once_no_walk_is_worth_it(robot, tmp_path):
+    _, command = robot
+    told = ("--trials", 20, "--initial", 4, "--repeats", 1, "--least-gain", 0.5, "--json")
+    study = pup(*command, *told).json()
+    assert study["settings"]["least_gain"] == 0.5 and len(study["trials"]) < 20
+    (chosen,) = (e["detail"] for e in study["history"] if e["kind"] == "chosen")
+    assert "expected to gain" in chosen["why"] and chosen["eta"] == study["eta"]
+    assert [t["purpose"] for t in study["trials"]][-1] == "repeat"
+
+
 def test_it_outlives_the_gateway_and_is_resumed(robot, service, tmp_path):
     """The gateway is killed meanwhile, and the verb itself interrupted."""
     agent, command = robot

@@ -195,3 +195,18 @@ def test_a_suggestion_at_25_walks_is_soon_there():
         suggest(asked, 26)
         spent.append(time.process_time() - began)
     assert np.quantile(spent[1:], 0.95) < 0.9
+
+
+def test_a_search_is_over_once_no_walk_is_expected_to_gain_enough():
+    """On a hill that is known all over; not while every eta falls, whatever is to be gained."""
+    rng = np.random.default_rng(0)
+    eta = np.vstack([np.zeros((6, 3)), rng.uniform(-1, 1, (40, 3))])
+    distance = 2.0 - 0.3 * (eta**2).sum(axis=1) + rng.normal(0, 0.002, len(eta))
+    known = suggest(search(eta, distance), 47)
+    assert known.best == pytest.approx(2.0, abs=0.005) and 0 < known.gain < 0.004
+    assert known.is_worth(0.0) and not known.is_worth(0.002)
+    early = suggest(search(eta[4:10], distance[4:10]), 7)
+    assert early.gain > known.gain and early.is_worth(0.002)
+    fallen = suggest(search(eta, distance - 3.0), 47)
+    assert fallen.gain == pytest.approx(known.gain, rel=0.3) and fallen.is_worth(0.5)
+    assert suggest(search(eta[:2], distance[:2]), 3).is_worth(0.5), "uniform ones are made anyway"

@@ -207,6 +207,15 @@ def test_a_study_ends_with_as_many_walks_as_were_asked_for(trials, repeats, bad)
     assert count[Purpose.REPEAT] == count[Purpose.COMPARE] == repeats
 
 
+def test_an_eta_that_was_chosen_early_ends_the_search():
+    settings = StudySettings("r", "p", trials=25, least_gain=0.01, repeats=2)
+    study = Study("s", settings, chosen=(0.0,) * 3)
+    assert next_step(study) == Walk((0.0,) * 3, Purpose.REPEAT)
+    for least in (-0.1, 1.0, float("nan")):
+        with pytest.raises(InputError, match="least_gain"):
+            StudySettings("r", "p", least_gain=least)
+
+
 def test_the_chosen_eta_and_its_rivals_take_turns():
     settings = StudySettings("r", "p", trials=1, initial=1, repeats=3, compare=((9.0,) * 3,))
     _, made = play(settings, itertools.repeat(Result(S.SUCCEEDED, 1.0)))

@@ -1,14 +1,16 @@
 """Which eta to try next, and which to keep (paper, section V).
 
 The middle of the box and a few uniform trials, or simulated rollouts in their place, then each
-trial where noisy expected improvement on the Gaussian process is largest; at the end the tried eta
-with the largest posterior mean, so that one lucky walk does not decide. Everything is a function of
-the data, the number of the trial and the seed: whoever is stopped and asks again is told the same.
+trial where noisy expected improvement on the Gaussian process is largest, as long as it is worth a
+walk; at the end the tried eta with the largest posterior mean, so that one lucky walk does not
+decide. Everything is a function of the data, the number of the trial and the seed: whoever is
+stopped and asks again is told the same.
 """
 
 import hashlib
+import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,7 +121,8 @@ class Decision:
       digest: SHA-256 of them.
       mean: expected distance, m; None without a process.
       deviation: of the expectation, m.
-      acquisition: logarithm of the expected improvement; None where it did not decide.
+      gain: expected over the best eta tried, m; None where it did not decide.
+      best: expected distance of that one, m; likewise.
       hyperparameters: of the process.
       seconds: that it took.
     """
@@ -131,9 +134,18 @@ class Decision:
     digest: str
     mean: float | None = None
     deviation: float | None = None
-    acquisition: float | None = None
+    gain: float | None = None
+    best: float | None = None
     hyperparameters: dict[str, Any] | None = None
     seconds: float = 0.0
+
+    def is_worth(self, least: float) -> bool:
+        """Whether a walk is expected to gain enough; always while nothing walks forward.
+
+        Args:
+          least: gain as a share of the best eta's distance.
+        """
+        return self.gain is None or self.best is None or self.gain >= least * self.best
 
 
 def suggest(search: Search, number: int) -> Decision:
@@ -157,24 +169,30 @@ def suggest(search: Search, number: int) -> Decision:
     surrogate = surrogate_of(search.told, search.prior)
     rng = np.random.default_rng((search.seed, number))
     if len(search.distance):
-        unit, value = _improve(surrogate, search.told, rng)
+        unit, gain = _improve(surrogate, search.told, rng)
+        best = float(surrogate.predict(search.told.eta)[0].max())
         why = "largest noisy expected improvement"
-    else:
-        candidates = _candidates(len(search.lower), rng)
-        unit, value = candidates[np.argmax(surrogate.predict(candidates)[0])], None
-        why = "best in simulation"
-    return _decision(search, surrogate, unit, Purpose.SEARCH, why, value, began)
+        decision = _decision(search, surrogate, unit, Purpose.SEARCH, why, began)
+        return replace(decision, gain=gain, best=best)
+    candidates = _candidates(len(search.lower), rng)
+    unit = candidates[np.argmax(surrogate.predict(candidates)[0])]
+    return _decision(search, surrogate, unit, Purpose.SEARCH, "best in simulation", began)
 
 
-def choose(search: Search) -> Decision:
-    """The eta to keep: of those tried, the one with the largest posterior mean."""
+def choose(search: Search, because: str = "") -> Decision:
+    """The eta to keep: of those tried, the one with the largest posterior mean.
+
+    Args:
+      search: what is known.
+      because: why the search ends, in words, where it does not end with its last trial.
+    """
     began = time.perf_counter()
     if not len(search.distance):
         raise InputError("nothing was walked yet, so nothing can be chosen")
     surrogate = surrogate_of(search.told, search.prior)
     unit = search.best(surrogate)
-    why = "largest posterior mean of the etas tried"
-    return _decision(search, surrogate, unit, Purpose.REPEAT, why, None, began)
+    why = "; ".join(filter(None, (because, "largest posterior mean of the etas tried")))
+    return _decision(search, surrogate, unit, Purpose.REPEAT, why, began)
 
 
 @dataclass(frozen=True)
@@ -216,7 +234,6 @@ def _decision(
     unit: Array,
     purpose: Purpose,
     why: str,
-    value: float | None,
     began: float,
 ) -> Decision:
     mean, deviation = surrogate.predict(unit[None])
@@ -228,9 +245,8 @@ def _decision(
         search.digest,
         float(mean[0]),
         float(deviation[0]),
-        value,
-        surrogate.hyperparameters,
-        time.perf_counter() - began,
+        hyperparameters=surrogate.hyperparameters,
+        seconds=time.perf_counter() - began,
     )
 
 
@@ -247,7 +263,7 @@ def _candidates(n_eta: int, rng: np.random.Generator) -> Array:
 
 
 def _improve(surrogate: Surrogate, told: Told, rng: np.random.Generator) -> tuple[Array, float]:
-    """Where the logarithm of noisy expected improvement is largest, and how large."""
+    """Where the logarithm of noisy expected improvement is largest; the improvement there, m."""
     n_eta = told.eta.shape[1]
     torch.manual_seed(int(rng.integers(2**31)))
     acquisition = qLogNoisyExpectedImprovement(
@@ -272,4 +288,4 @@ def _improve(surrogate: Surrogate, told: Told, rng: np.random.Generator) -> tupl
         batch_initial_conditions=starts,
         options={"maxiter": 25},
     )
-    return found[0].clamp(0, 1).numpy(), float(value)
+    return found[0].clamp(0, 1).numpy(), surrogate.scale * math.exp(float(value))

@@ -12,7 +12,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class Suggest:
-    """The search needs another eta."""
+    """The search needs another eta, if one is worth a walk."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,8 @@ def next_step(study: Study) -> Step:
     if study.state is not StudyState.ACTIVE or study.open:
         return Wait()
     settings = study.settings
-    if len(study.searched) < settings.trials:
-        return Suggest()
     if study.chosen is None:
-        return Choose()
+        return Suggest() if len(study.searched) < settings.trials else Choose()
     rivals = [(study.chosen, Purpose.REPEAT)]
     rivals += [(eta, Purpose.COMPARE) for eta in settings.compare]
     walked = [sum(1 for t in study.told if (t.eta, t.purpose) == rival) for rival in rivals]

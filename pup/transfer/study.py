@@ -118,8 +118,10 @@ class StudySettings:
       policy: SHA-256 of the bundle's `policy.json`.
       lower: of the box that eta is searched in, shape (n_eta,).
       upper: likewise.
-      trials: that count, before eta is chosen.
+      trials: that count, before eta is chosen; the most, with `least_gain`.
       initial: uniform ones among them.
+      least_gain: eta is chosen once a further trial is expected to gain less, as a share of the
+        best eta's distance; 0 makes all trials.
       repeats: walks of the chosen eta afterwards, and of each one in `compare`.
       compare: etas from elsewhere.
       horizon: longest walk, s.
@@ -137,6 +139,7 @@ class StudySettings:
     upper: Eta = (1.0, 1.0, 1.0)
     trials: int = 25
     initial: int = 5
+    least_gain: float = 0.0
     repeats: int = 5
     compare: tuple[Eta, ...] = ()
     horizon: float = 15.0
@@ -159,6 +162,8 @@ class StudySettings:
             raise InputError(f"each eta in compare needs {n} finite numbers")
         if min(self.trials, self.initial) < 1:
             raise InputError("trials and initial must be 1 or more")
+        if not 0 <= self.least_gain < 1:
+            raise InputError("least_gain must be from 0 up to 1")
 
 
 @dataclass(frozen=True)

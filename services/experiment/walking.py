@@ -47,7 +47,8 @@ def walk(
       All walks; distances (m) and times (s) of those of the `chosen` eta and, where there are
       bounds, of the `fitted` one.
     """
-    budget = Budget(told["trials"], told["repeats"], told["seed"], told["horizon"])
+    asked = ("trials", "repeats", "seed", "horizon")
+    budget = Budget(**{name: told[name] for name in asked})
     compare = []
     if bounds is not None:
         eta = fitted_eta(NumpyPolicy.load(policy, robot), read_bounds(bounds, fitted_on))

@@ -393,16 +393,22 @@ class Conductor:
             case Suggest():
                 with self.metrics.suggest.time():
                     decision = await self.fits.run(fits.suggest, study, self.simulated[study.name])
-                await self._add(study, decision.eta, decision.purpose, asdict(decision))
+                if decision.purpose is Purpose.REPEAT:
+                    await self._keep(study, decision)
+                else:
+                    await self._add(study, decision.eta, decision.purpose, asdict(decision))
             case Walk(eta, purpose):
                 await self._add(study, eta, purpose, {"eta": list(eta), "purpose": purpose.value})
             case Choose():
                 decision = await self.fits.run(fits.choose, study, self.simulated[study.name])
-                study = replace(study, chosen=decision.eta)
-                await self._write(Change(study, events=[Event("chosen", detail=asdict(decision))]))
+                await self._keep(study, decision)
             case Finish():
                 study = replace(study, state=StudyState.DONE)
                 await self._write(Change(study, events=[Event("done")]))
+
+    async def _keep(self, study: Study, decision: Any) -> None:
+        study = replace(study, chosen=decision.eta)
+        await self._write(Change(study, events=[Event("chosen", detail=asdict(decision))]))
 
     async def _add(self, study: Study, eta: Any, purpose: Purpose, why: Row) -> None:
         released = study.settings.gate is Gate.AUTO

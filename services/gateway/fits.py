@@ -107,10 +107,15 @@ def search_of(study: Study, simulated: Row | None) -> Any:
 
 
 def suggest(study: Study, simulated: Row | None) -> Any:
-    """The decision on the next trial's eta."""
+    """The decision on the next trial's eta; on the one to keep, where none is worth a walk."""
     from pup.transfer import optimizer
 
-    return optimizer.suggest(search_of(study, simulated), len(study.trials) + 1)
+    search = search_of(study, simulated)
+    decision = optimizer.suggest(search, len(study.trials) + 1)
+    if decision.is_worth(study.settings.least_gain):
+        return decision
+    share = f"{decision.gain / decision.best:.2%}"
+    return optimizer.choose(search, f"another walk is expected to gain {share} only")
 
 
 def choose(study: Study, simulated: Row | None) -> Any:

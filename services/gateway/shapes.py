@@ -66,6 +66,7 @@ class NewStudy(Strict):
     upper: Eta = list(Defaults.upper)
     trials: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.trials
     initial: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.initial
+    least_gain: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = Defaults.least_gain
     repeats: Annotated[int, Field(ge=0, le=100), WITHOUT_FRACTION] = Defaults.repeats
     compare: Annotated[list[Eta], Field(max_length=16)] = []
     horizon: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = Defaults.horizon
