@@ -281,7 +281,7 @@ def _diagnosis(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
                 f"{finding['place']['kind']} {', '.join(finding['place']['names'])}".strip(),
                 finding["regime"],
                 f"{finding['probability']:.0%}",
-                finding["law"],
+                finding["law"] or "none that held",
             )
             for finding in told["findings"]
         ]

@@ -29,7 +29,7 @@ from services import training
 from workers.cluster import connected
 from workers.learner import Learning, merged, prepared, shuffled
 from workers.module import PolicyModule
-from workers.ppo import Setup, Trainer
+from workers.ppo import Setup, Trainer, learner_place
 from workers.rollouts import Sampler, Sampling, spaces
 
 SHAPE = PolicyShape.of(Method.PUP, 2, 2, 2)
@@ -296,3 +296,18 @@ def test_policies_that_see_no_parameters(ray_here: None, tmp_path: Path, method:
     run = NumpyPolicy.load(tmp_path / "policy", ROBOT)
     assert run.card.shape.eta == 0
     assert run.act(np.zeros(44), np.zeros(0)).shape == (20,)
+
+
+@pytest.mark.parametrize(
+    ("minibatch", "here", "anywhere", "place"),
+    [
+        (256, True, True, (0, 0)),  # a core is faster
+        (4096, True, True, (0, 1)),
+        (4096, False, True, (1, 1)),
+        (4096, False, False, (0, 0)),
+    ],
+)
+def test_the_learner_takes_a_gpu_where_it_is_faster(
+    minibatch: int, here: bool, anywhere: bool, place: tuple[int, int]
+) -> None:
+    assert learner_place(minibatch, here, anywhere) == place
