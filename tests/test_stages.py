@@ -161,6 +161,15 @@ def test_the_report_tells_what_each_stage_found_and_hashes(tmp_path: Path) -> No
             "fitted": {"distance": [], "mean": None, "std": None},
             "walks": walks,
         },
+        "diagnosis": {
+            "verdict": "mismatch",
+            "reason": "",
+            "held_out": None,
+            "findings": [
+                {"effect": "unknown", "place": {"kind": "robot", "names": ["r"]}, "law": None}
+                | {"regime": "at high speed", "probability": 0.29}
+            ],
+        },
     }
     done = {n: Done({"robot r": "f" * 64}, 61.4, {f"{n}/x.json": "e" * 64}) for n in documents}
     write_report(Job("r<obot", tmp_path, documents, done, {"train": "as told"}))
@@ -168,22 +177,7 @@ def test_the_report_tells_what_each_stage_found_and_hashes(tmp_path: Path) -> No
     assert "<b>fell" in page.text and "Job of r<obot" in page.text
     assert not {"b", "i", "script"} & {name for name, _ in page.elements}
     assert "left out: as told" in page.text
+    assert "at high speed29%none that held" in page.text  # a part without a name or a law
     assert "e" * 64 in page.text and "f" * 64 in page.text
     words = found(documents)["transfer"]
     assert words == "2 trials; chosen eta 0.80 ± 0.14 m, eta of the fitted parameters not walked"
-
-
-def test_a_part_without_a_name_has_no_law_and_is_told(tmp_path: Path) -> None:
-    """A diagnosis may see that something is missing and find no law that holds for it."""
-    finding = {
-        "effect": "unknown",
-        "place": {"kind": "robot", "names": ["r"]},
-        "regime": "at high speed",
-        "probability": 0.29,
-        "law": None,
-    }
-    told = {"verdict": "mismatch", "reason": "", "findings": [finding], "held_out": None}
-    done = {"diagnosis": Done({}, 1.0, {})}
-    write_report(Job("r", tmp_path, {"diagnosis": told}, done, {}))
-    text = Page(tmp_path / "report.html").text
-    assert "at high speed" in text and "29%" in text and "none that held" in text

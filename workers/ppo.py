@@ -25,8 +25,8 @@ from workers.rollouts import BatchRunner, Fragment, Sampling, spaces
 
 State = dict[str, NDArray[Any]]
 GPU_MINIBATCH = 1024
-"""Samples from which a step of the learner takes a GPU: with 256 a core of a processor is faster, 6 ms
-against 9, with 4,096 a GPU, 10 ms (docs/results/training.md)."""
+"""Samples from which a step of the learner takes a GPU: with 256 a core of a processor is faster,
+6 ms against 9, with 4,096 a GPU, 10 ms (docs/results/training.md)."""
 
 
 @dataclass(frozen=True)
