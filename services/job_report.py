@@ -104,9 +104,12 @@ def _training_words(told: Mapping[str, Any]) -> str:
 
 
 def _walk_words(told: Mapping[str, Any]) -> str:
+    shown = told["shown"]
+    fell = f", fallen after {shown['time']:.1f} s" if shown["fell"] else ""
     return (
-        f"median {told['distance_median']:.2f} m in {told['time_median']:.1f} s with parameters "
-        f"from the bounds, {told['upright_share']:.0%} without a fall"
+        f"{shown['distance']:.2f} m with the fitted parameters{fell}; median "
+        f"{told['distance_median']:.2f} m in {told['time_median']:.1f} s over the bounds, "
+        f"{told['upright_share']:.0%} without a fall"
     )
 
 
@@ -178,7 +181,8 @@ def _facts(job: Job) -> Iterator[Html]:
         yield _fact(f"Joint error{of}", f"{replayed['rmse']:.3g} {unit}", more)
         if walked := told.get(f"{half}walk"):
             median = walked["distance_median"]
-            yield _fact(f"Walk in simulation{of}", f"{median:.2f} m", "median over the bounds")
+            fitted = f"median over the bounds; {walked['shown']['distance']:.2f} m as fitted"
+            yield _fact(f"Walk in simulation{of}", f"{median:.2f} m", fitted)
         if tried := told.get(f"{half}transfer"):
             yield _fact(f"Virtual robot, chosen eta{of}", spread(tried["chosen"]), "")
             yield _fact(f"Virtual robot, eta fitted{of}", spread(tried["fitted"]), "no trials")

@@ -181,3 +181,15 @@ def test_the_report_tells_what_each_stage_found_and_hashes(tmp_path: Path) -> No
     assert "e" * 64 in page.text and "f" * 64 in page.text
     words = found(documents)["transfer"]
     assert words == "2 trials; chosen eta 0.80 ± 0.14 m, eta of the fitted parameters not walked"
+
+
+def test_a_walk_is_told_as_fitted_and_over_the_bounds() -> None:
+    """Wide bounds hold robots that no policy keeps up; the fitted one may walk nevertheless."""
+    shown = {"distance": 1.3, "time": 14.0, "fell": False}
+    median = {"distance_median": 0.2, "time_median": 1.0, "upright_share": 0.25}
+    over = "median 0.20 m in 1.0 s over the bounds, 25% without a fall"
+    told = found({"walk": {"shown": shown, **median}})["walk"]
+    assert told == f"1.30 m with the fitted parameters; {over}"
+    fallen = {"distance": -0.1, "time": 2.5, "fell": True}
+    told = found({"corrected-walk": {"shown": fallen, **median}})["corrected-walk"]
+    assert told == f"-0.10 m with the fitted parameters, fallen after 2.5 s; {over}"
