@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 
 from policies import MIRROR, OBSERVATION, ROBOT, SIZES, observations, policy_of  # noqa: E402
 
+from pup.policy.gradients import differentiated  # noqa: E402
 from pup.policy.losses import (  # noqa: E402
     LossWeights,
     Samples,
@@ -179,6 +180,32 @@ def test_losses_of_the_policy_that_drew() -> None:
     assert float(told.clipped) == 0
     assert told.policy.item() == pytest.approx(-float(samples.advantages.mean()), abs=1e-4)
     assert float(told.mirror) == 0
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("method", Method)
+def test_gradients_written_out_are_those_of_autograd(method: Method, mirrored: bool) -> None:
+    """With an entropy and actions on both sides of the clip, in double precision."""
+    torch.manual_seed(0)
+    policy = policy_of(method).double()
+    for normaliser in (policy.observations, policy.returns):
+        normaliser.mean += 0.3
+        normaliser.variance *= 2.0
+    samples = samples_of(policy.float(), 65)
+    policy.double()
+    samples = Samples(*(x.double() if x.is_floating_point() else x for x in samples))
+    samples = samples._replace(log=samples.log + 0.4 * torch.randn(65).double())
+    weights = LossWeights(entropy=0.3, mirror=0.7 if mirrored else 0.0, value=0.9)
+    mirror = TorchMirror(MIRROR)
+    mirror.signs = mirror.signs.double()
+    expected = losses(policy, samples, weights, mirror)
+    expected.total.backward()
+    told, found = differentiated(policy, samples, weights, mirror)
+    assert 0.1 < told.clipped < 0.9
+    for one, other in zip(told, expected, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-10, atol=1e-12)
+    for gradient, (name, parameter) in zip(found, policy.named_parameters(), strict=True):
+        torch.testing.assert_close(gradient, parameter.grad, rtol=1e-9, atol=1e-12, msg=name)
 
 
 def test_advantages_by_hand() -> None:

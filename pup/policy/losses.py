@@ -119,14 +119,7 @@ def losses(
 ) -> Losses:
     """PPO's losses of a minibatch, and the mirror loss of half of it."""
     count = len(samples.log)
-    seen, parameters = samples.proprioception, samples.parameters
-    half = 0
-    if (
-        mirror is not None and weights.mirror > 0
-    ):  # of the samples, which are shuffled: enough for a tendency, at half the price
-        half = count // 2
-        seen = torch.cat([seen, mirror.observation(seen[:half])])
-        parameters = torch.cat([parameters, parameters[:half, mirror.parameters]])
+    seen, parameters, half = with_mirrored(samples, weights, mirror)
     whole = torch.log_softmax(policy(seen, parameters), dim=-2)
     log, other = whole.split([count, half])
     apart = whole.new_zeros(())
@@ -146,6 +139,21 @@ def losses(
         kl = (ratio - 1 - change).mean()
         clipped = (ratio != kept).float().mean()
     return Losses(total, surrogate, value, apart, entropy, kl, clipped)
+
+
+def with_mirrored(
+    samples: Samples, weights: LossWeights, mirror: TorchMirror | None
+) -> tuple[Tensor, Tensor, int]:
+    """Observations and mu, then those of mirrored samples, and how many these are.
+
+    Half of the samples are mirrored, which are shuffled: enough for a tendency, at half the price.
+    """
+    seen, parameters = samples.proprioception, samples.parameters
+    if mirror is None or weights.mirror <= 0:
+        return seen, parameters, 0
+    half = len(samples.log) // 2
+    seen = torch.cat([seen, mirror.observation(seen[:half])])
+    return seen, torch.cat([parameters, parameters[:half, mirror.parameters]]), half
 
 
 def advantages(

@@ -91,10 +91,17 @@ class ProjectedPolicy(torch.nn.Module):
           parameters: mu on the unit scale of the bounds, shape (n, n_parameters); not looked at
             by a policy that sees none.
         """
+        told = self.conditions(parameters)
+        return torch.tanh(self.projection(told)) if self.shape.latent else told
+
+    def conditions(self, parameters: Tensor) -> Tensor:
+        """Mu about 0: all of it where it is projected, else what the policy sees of it."""
         centred = 2 * parameters - 1
-        if self.shape.latent:
-            return torch.tanh(self.projection(centred))
-        return centred[..., : self.shape.eta]
+        return centred if self.shape.latent else centred[..., : self.shape.eta]
+
+    def privileged(self, true_parameters: Tensor) -> Tensor:
+        """What the value function sees of mu, about 0."""
+        return 2 * true_parameters[..., : self.shape.privileged] - 1
 
     def logits(self, proprioception: Tensor, eta: Tensor) -> Tensor:
         """Logits of the bins, shape (n, bins, joints)."""
@@ -107,7 +114,7 @@ class ProjectedPolicy(torch.nn.Module):
 
     def value(self, proprioception: Tensor, true_parameters: Tensor) -> Tensor:
         """Values in units of the returns' standard deviation from their mean, shape (n,)."""
-        known = 2 * true_parameters[..., : self.shape.privileged] - 1
+        known = self.privileged(true_parameters)
         return self.critic(torch.cat([self.observations(proprioception), known], dim=-1))[..., 0]
 
     @torch.no_grad()
