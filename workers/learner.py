@@ -160,7 +160,6 @@ class MirrorLearner(PPOTorchLearner):
         self.mirror = None if mirror is None else TorchMirror(mirror, self._device)
         self.weights = self.learning.weights
         self.logged: list[Losses] = []
-        self.found: tuple[torch.Tensor, ...] = ()
         self.iteration = 0
 
     @property
@@ -195,22 +194,22 @@ class MirrorLearner(PPOTorchLearner):
     ) -> torch.Tensor:
         """See Learner."""
         samples = Samples(*(batch[name] for name in Samples._fields))
-        given = self.policy_module.policy, samples, self._weights_now(), self.mirror
+        policy = self.policy_module.policy
+        given = policy, samples, self._weights_now(), self.mirror
         if self._device.type == "cpu":
-            told, self.found = differentiated(*given)
+            told, gradients = differentiated(*given)
+            for parameter, gradient in zip(policy.parameters(), gradients, strict=True):
+                parameter.grad = gradient
         else:
             told = losses(*given)
         self.logged.append(Losses(*(value.detach() for value in told)))
         return told.total
 
     def compute_gradients(self, loss_per_module: dict[str, Any], **more: Any) -> Any:
-        """They are known already, or left to autograd. See Learner."""
-        if self._device.type != "cpu":
-            return super().compute_gradients(loss_per_module, **more)
-        parameters = self.policy_module.policy.parameters()
-        for parameter, gradient in zip(parameters, self.found, strict=True):
-            parameter.grad = gradient
-        return {}
+        """They came with the loss, or are left to autograd. See Learner."""
+        if self._device.type == "cpu":
+            return {}
+        return super().compute_gradients(loss_per_module, **more)
 
     def postprocess_gradients(self, gradients_dict: Any) -> Any:
         """They are clipped where they are applied. See Learner."""

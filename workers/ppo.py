@@ -199,8 +199,6 @@ def _start(setup: Setup) -> BatchPPO:
             minibatch_size=setup.learning.minibatch,
             num_epochs=1,  # FragmentsToBatch lays them out
             lr=setup.learning.rate,
-            grad_clip=setup.learning.gradient,
-            grad_clip_by="global_norm",
             use_kl_loss=False,
             vf_clip_param=float("inf"),
         )

@@ -1,7 +1,7 @@
 """The losses of `pup.policy.losses` and their gradients, written out.
 
 An iteration takes hundreds of steps of a few hundred samples. On a processor, autograd's records of
-such small operations take a fifth of each step; on a GPU they are hidden. Numbers are the same.
+such small operations take a fifth of each step. Numbers are the same. On a GPU it was not tried.
 """
 
 from collections.abc import Sequence
