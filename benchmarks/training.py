@@ -76,9 +76,7 @@ def main() -> None:
     with ExitStack() as stack:
         stack.enter_context(connected(cores=given.threads))
         rivals: dict[str, Callable[[], object]] = {"physics": _physics(work)}
-        rivals["ours"] = stack.enter_context(
-            closing(Trainer(Setup(work.shape, work.sampling, work.learning)))
-        ).iterate
+        rivals["ours"] = _ours(work, stack)
         rivals["bare"] = _bare(work)
         rivals["stock"] = _stock(work, stack)
         if find_spec("stable_baselines3"):
@@ -124,6 +122,16 @@ def _physics(work: Work) -> Callable[[], object]:
     def run() -> None:
         for _ in range(s.steps):
             task.step(rng.integers(0, task.bins, (task.n, len(task.joints))))
+
+    return run
+
+
+def _ours(work: Work, stack: ExitStack) -> Callable[[], object]:
+    trainer = stack.enter_context(closing(Trainer(Setup(work.shape, work.sampling, work.learning))))
+
+    def run() -> None:
+        trainer.iterate()
+        trainer.algorithm.settle()  # what it samples for the next is not for others to pay
 
     return run
 

@@ -17,18 +17,19 @@ pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 
 import torch
+from ray.rllib.core import DEFAULT_MODULE_ID
 
 from pup.errors import InputError
 from pup.physics.parameters import robot_space
 from pup.policy.bundle import NumpyPolicy
-from pup.policy.losses import LossWeights
+from pup.policy.losses import LossWeights, Samples
 from pup.policy.network import ProjectedPolicy
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
 from services import training
 from workers.cluster import connected
-from workers.learner import Learning, merged, prepared, shuffled
-from workers.module import PolicyModule
+from workers.learner import FragmentsToBatch, Learning, merged, prepared, shuffled
+from workers.module import PolicyModule, load
 from workers.ppo import Setup, Trainer, learner_place
 from workers.rollouts import Sampler, Sampling, spaces
 
@@ -112,6 +113,29 @@ def test_samples_of_fragments() -> None:
     np.testing.assert_allclose(told, values.detach().numpy(), atol=1e-4)
 
 
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+def test_samples_of_older_weights_are_weighted(bias: float) -> None:
+    """By how likely their actions have become; what the clip counts from is the policy of now."""
+    fragment = Sampler(SAMPLING, 1).sample(policy())
+    now = module()
+    load(now.policy, {k: v.numpy() for k, v in policy().state_dict().items()})
+    with torch.no_grad():
+        now.policy.actor[-1].bias[5 * SHAPE.joints : 6 * SHAPE.joints] += bias  # the middle
+    batch = FragmentsToBatch(LEARNING)(rl_module={DEFAULT_MODULE_ID: now}, episodes=[fragment])
+    told = Samples(**batch[DEFAULT_MODULE_ID])
+    drawn = prepared(now, fragment, LEARNING)
+    order = torch.from_numpy(shuffled(len(drawn.log), LEARNING, np.random.default_rng((0, 0))))
+    taken = (drawn.bins == 5).sum(dim=1)[order]
+    ratio = (told.log - drawn.log[order]).exp()
+    standard = (drawn.advantages - drawn.advantages.mean()) / drawn.advantages.std()
+    weight = told.advantages / standard[order]
+    torch.testing.assert_close(weight, ratio.clamp(max=2.0), rtol=1e-3, atol=1e-3)
+    if not bias:
+        torch.testing.assert_close(ratio, torch.ones_like(ratio))
+    else:
+        assert ratio[taken == 0].max() < 1 < ratio[taken == 2].min()
+
+
 def test_epochs_are_shuffled_alike_by_seed() -> None:
     """Every epoch has whole minibatches of different samples, in another order."""
     order = shuffled(1000, replace(LEARNING, epochs=3), np.random.default_rng(1))
@@ -139,11 +163,11 @@ def weights_after(setup: Setup, iterations: int) -> dict[str, np.ndarray]:
 
 @pytest.mark.ray
 def test_a_toy_is_learnt(ray_here: None) -> None:
-    """Masses come to rest within 30 iterations, and the value function knows it."""
-    with closing(Trainer(TOY)) as trainer:
-        told = [trainer.iterate() for _ in range(30)]
+    """Masses come to rest within 60 iterations, and the value function knows it."""
+    with closing(Trainer(replace(TOY, learning=replace(LEARNING, iterations=60)))) as trainer:
+        told = [trainer.iterate() for _ in range(60)]
     assert told[0].reward < 0.3
-    assert told[-1].reward > 0.85
+    assert np.mean([one.reward for one in told[-10:]]) > 0.7
     assert told[-1].learnt["value"] < 0.1
     assert told[-1].learnt["rate"] < 0.2 * told[0].learnt["rate"]
     assert told[-1].ended[:, 3].mean() < 0.05
@@ -185,6 +209,7 @@ def test_training_outlives_a_runner(ray_here: None) -> None:
         assert trainer.iterate().steps == 2048
         first, _ = trainer.each_runner(lambda runner: os.getpid())
         os.kill(first, signal.SIGKILL)
+        assert trainer.iterate().steps == 2048  # were sampled before
         struck = trainer.iterate()
         assert (struck.steps, struck.lost) == (1024, 1024)
         for _ in range(60):
@@ -192,9 +217,12 @@ def test_training_outlives_a_runner(ray_here: None) -> None:
                 break
             time.sleep(0.5)
         assert trainer.iterate().lost == 0
+        before = trainer.weights()["actor.0.weight"]
+        trainer.iterate()  # beside it, the runners sample with the weights it began with
         weights = trainer.each_runner(lambda r: r.module.policy.actor[0].weight.detach().numpy())
         assert np.array_equal(weights[0], weights[1])
-        assert np.array_equal(weights[0], trainer.weights()["actor.0.weight"])
+        assert np.array_equal(weights[0], before)
+        assert not np.array_equal(weights[0], trainer.weights()["actor.0.weight"])
 
 
 # --- The job --------------------------------------------------------------------------------------

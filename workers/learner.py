@@ -15,11 +15,14 @@ from ray.rllib.core.columns import Columns
 from pup.policy.gradients import differentiated
 from pup.policy.losses import Losses, LossWeights, Samples, TorchMirror, advantages, losses
 from pup.policy.mirror import MirrorMap
+from pup.policy.network import ProjectedPolicy, log_probability
 from workers.module import PolicyModule, load
 from workers.rollouts import Fragment
 
 CHUNK = 16384
-"""States whose values are computed at once."""
+"""States whose values or actions are judged at once."""
+IMPORTANCE = 2.0
+"""Largest weight of a sample that a policy has become more likely to draw since it was drawn."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,11 @@ class Learning:
 class FragmentsToBatch(ConnectorV2):
     """Makes one batch of fragments: advantages, then every epoch's samples in an order of its own.
 
+    The samples were drawn with the weights of an iteration ago. PPO's clip would hold the policy
+    near those, and let it move half as far in each iteration; here it is held near the weights that
+    the iteration begins with, and samples are weighted by how much likelier they are with these
+    (Hilton, Cobbe and Schulman 2022, the decoupled objective).
+
     RLlib then sees a single epoch, so that the first one is shuffled too, and a training that goes
     on needs no generator's state.
     """
@@ -80,8 +88,11 @@ class FragmentsToBatch(ConnectorV2):
         samples = merged([prepared(module, f, self.learning) for f in episodes])
         policy = module.policy
         module.shown = samples.proprioception, samples.returns
+        log = likelihoods(policy, samples)
+        importance = (log - samples.log).exp().clamp(max=IMPORTANCE)
         scaled = samples._replace(
-            advantages=_standard(samples.advantages),
+            log=log,
+            advantages=_standard(samples.advantages) * importance,
             returns=(samples.returns - policy.returns.mean) / policy.returns.scale,
         )
         rng = np.random.default_rng((self.learning.seed, self.iteration))
@@ -131,6 +142,18 @@ def prepared(module: PolicyModule, fragment: Fragment, learning: Learning) -> Sa
     returns = (tensor(ahead) + tensor(values[:-1])).flatten()[live]
     seen = [s[: fragment.reward.size][live] for s in states]
     return Samples(*seen, flat[0].long(), flat[1][:, 0], flat[2][:, 0], returns)
+
+
+@torch.no_grad()
+def likelihoods(policy: ProjectedPolicy, samples: Samples) -> torch.Tensor:
+    """Logarithms of the probabilities of the samples' actions with the weights of now, (n,)."""
+    columns = (samples.proprioception, samples.parameters, samples.bins)
+    chunks = zip(*(column.split(CHUNK) for column in columns), strict=True)
+    told = [
+        log_probability(torch.log_softmax(policy(seen, mu), dim=-2), bins)
+        for seen, mu, bins in chunks
+    ]
+    return torch.cat(told)
 
 
 def merged(samples: Sequence[Samples]) -> Samples:

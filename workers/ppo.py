@@ -5,7 +5,8 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium
@@ -66,7 +67,7 @@ class Iteration:
       lost: not sampled because runners were lost.
       ended: see Fragment, of all runners.
       reward: mean of a live step.
-      seconds: of sampling and of learning.
+      seconds: of waiting for samples and of learning.
       learnt: means of the losses, the rate.
     """
 
@@ -79,9 +80,20 @@ class Iteration:
 
 
 class BatchPPO(PPO):
-    """PPO whose iteration goes on with the runners that answer, and counts what was lost."""
+    """PPO that samples while it learns, goes on with the runners that answer, and counts the lost.
+
+    The fragments of an iteration are sampled during the one before, with the weights that that one
+    began with: neither the runners nor the learner wait for each other. What is sampled with which
+    weights does not hang on the clock, so that equal seeds still give equal weights.
+    """
 
     told: Iteration
+
+    def setup(self, config: Any) -> None:
+        """See Algorithm."""
+        super().setup(config)
+        self._thread = ThreadPoolExecutor(1, "sampling")
+        self._coming: Future[list[Fragment]] | None = None
 
     def _setup_logdir(self) -> None:
         """Without a folder of RLlib's own in the user's home; results are told elsewhere."""
@@ -90,20 +102,21 @@ class BatchPPO(PPO):
 
     def cleanup(self) -> None:
         """See Algorithm."""
+        self._thread.shutdown()
         super().cleanup()
         self._folder.cleanup()
 
     def training_step(self) -> None:
         """See Algorithm."""
         begin = time.perf_counter()
-        fragments = self._sampled()
+        fragments = self.coming()
+        self._begin()
         if not fragments:
             self.told = Iteration(0, self._expected(), np.empty((0, 4)), np.nan, (0.0, 0.0), {})
             return
         sampled = time.perf_counter()
         results = self.learner_group.update(episodes=fragments, timesteps={}, **self._batches())
         self.metrics.aggregate(results, key="learners")
-        self.broadcast()
         steps = sum(map(len, fragments))
         live = sum(int(f.live.sum()) for f in fragments)
         self.told = Iteration(
@@ -114,6 +127,32 @@ class BatchPPO(PPO):
             seconds=(sampled - begin, time.perf_counter() - sampled),
             learnt=_numbers(results[0][DEFAULT_MODULE_ID]),
         )
+
+    def coming(self) -> list[Fragment]:
+        """What the coming iteration learns from; after this nothing is being sampled."""
+        coming = self._coming or self._begin()
+        return coming.result()
+
+    def bring(self, fragments: list[Fragment]) -> None:
+        """Let the coming iteration learn from these."""
+        self._coming = Future()
+        self._coming.set_result(fragments)
+
+    def settle(self) -> None:
+        """Wait until nothing is being sampled; runners answer no two questions at once."""
+        if self._coming:
+            wait([self._coming])
+
+    def _begin(self) -> Future[list[Fragment]]:
+        """Sample with the learner's weights of now, beside what this process does next."""
+        super().restore_env_runners(self.env_runner_group)
+        self._broadcast()
+        self._coming = self._thread.submit(self._sampled)
+        return self._coming
+
+    def restore_env_runners(self, env_runner_group: Any) -> list[int]:
+        """Nothing: RLlib asks for it in the midst of sampling, `_begin` does it before."""
+        return []
 
     def _expected(self) -> int:
         return int(self.config.train_batch_size)
@@ -130,7 +169,7 @@ class BatchPPO(PPO):
         told = group.foreach_env_runner(lambda runner: runner.sample(), local_env_runner=False)
         return [fragment for one in told for fragment in one]
 
-    def broadcast(self) -> None:
+    def _broadcast(self) -> None:
         """Give the runners the learner's weights; a runner in this process needs no Ray for it."""
         group = self.env_runner_group
         if group.num_remote_env_runners():
@@ -246,6 +285,8 @@ class Trainer:
     def state(self) -> State:
         """All that a training which goes on alike needs, as arrays by name."""
         told = {f"learner/{k}": v for k, v in self._learner().items()}
+        for i, fragment in enumerate(self.algorithm.coming()):
+            told |= {f"coming{i}/{f.name}": getattr(fragment, f.name) for f in fields(Fragment)}
         for i, runner in enumerate(self.each_runner(lambda one: one.sampler.state())):
             told |= {f"runner{i}/{k}": v for k, v in runner.items()}
         return told
@@ -254,13 +295,16 @@ class Trainer:
         """Go on where another training with as many runners told its state."""
         learner = _below(state, "learner")
         self.algorithm.learner_group.foreach_learner(lambda one: one.restore_training(learner))
-        states = [_below(state, f"runner{i}") for i in range(max(1, self.runners))]
+        runners = range(max(1, self.runners))
+        states = [_below(state, f"runner{i}") for i in runners]
 
         def give(runner: BatchRunner) -> None:
             runner.sampler.restore(states[max(0, runner.worker_index - 1)])
 
         self.each_runner(give)
-        self.algorithm.broadcast()
+        kept = [Fragment(**arrays) for i in runners if (arrays := _below(state, f"coming{i}"))]
+        if kept:
+            self.algorithm.bring(kept)
 
     def close(self) -> None:
         """End its processes."""
@@ -273,6 +317,7 @@ class Trainer:
 
     def each_runner(self, action: Callable[[BatchRunner], Any]) -> list[Any]:
         """What the runners that sample answer, in their order."""
+        self.algorithm.settle()
         group = self.algorithm.env_runner_group
         return list(group.foreach_env_runner(action, local_env_runner=not self.runners))
 
