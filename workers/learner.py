@@ -72,8 +72,7 @@ class FragmentsToBatch(ConnectorV2):
     the iteration begins with, and samples are weighted by how much likelier they are with these
     (Hilton, Cobbe and Schulman 2022, the decoupled objective).
 
-    RLlib then sees a single epoch, so that the first one is shuffled too, and a training that goes
-    on needs no generator's state.
+    A training that goes on needs no generator's state.
     """
 
     def __init__(self, learning: Learning) -> None:
@@ -181,7 +180,7 @@ class MirrorLearner(PPOTorchLearner):
         super().build()
         mirror = self.learning.mirror
         self.mirror = None if mirror is None else TorchMirror(mirror, self._device)
-        self.weights = self.learning.weights
+        self.parameters = list(self.policy_module.policy.parameters())
         self.logged: list[Losses] = []
         self.iteration = 0
 
@@ -212,44 +211,36 @@ class MirrorLearner(PPOTorchLearner):
         (connector,) = self._learner_connector.connectors
         connector.iteration = self.iteration
 
-    def compute_loss_for_module(
-        self, *, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Any]
-    ) -> torch.Tensor:
-        """See Learner."""
-        samples = Samples(*(batch[name] for name in Samples._fields))
+    def _update(self, batch: dict[str, Any], **_: Any) -> tuple[Any, Any, Any]:
+        """All steps of an iteration; RLlib asks for each by itself, for a third of its time.
+
+        See TorchLearner.
+        """
+        given = batch[DEFAULT_MODULE_ID]
+        columns = (given[name].split(self.learning.minibatch) for name in Samples._fields)
+        weights = self._weights_now()
+        for minibatch in zip(*columns, strict=True):
+            self._step(Samples(*minibatch), weights)
+        return {}, {DEFAULT_MODULE_ID: self.logged[-1].total}, {}
+
+    def _step(self, samples: Samples, weights: LossWeights) -> None:
+        """Descend by a minibatch; gradients that are no numbers move nothing."""
         policy = self.policy_module.policy
-        given = policy, samples, self._weights_now(), self.mirror
         if self._device.type == "cpu":
-            told, gradients = differentiated(*given)
-            for parameter, gradient in zip(policy.parameters(), gradients, strict=True):
+            told, gradients = differentiated(policy, samples, weights, self.mirror)
+            for parameter, gradient in zip(self.parameters, gradients, strict=True):
                 parameter.grad = gradient
         else:
-            told = losses(*given)
-        self.logged.append(Losses(*(value.detach() for value in told)))
-        return told.total
-
-    def compute_gradients(self, loss_per_module: dict[str, Any], **more: Any) -> Any:
-        """They came with the loss, or are left to autograd. See Learner."""
-        if self._device.type == "cpu":
-            return {}
-        return super().compute_gradients(loss_per_module, **more)
-
-    def postprocess_gradients(self, gradients_dict: Any) -> Any:
-        """They are clipped where they are applied. See Learner."""
-        return gradients_dict
-
-    def apply_gradients(self, gradients_dict: Any) -> None:
-        """Clip all at once and step; RLlib looks at each parameter by itself, for 15 % of a step.
-
-        Gradients that are no numbers move nothing. See Learner.
-        """
-        parameters = self.policy_module.policy.parameters()
-        norm = torch.nn.utils.clip_grad_norm_(parameters, self.learning.gradient, foreach=True)
+            told = losses(policy, samples, weights, self.mirror)
+            self.optimizer.zero_grad()
+            told.total.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.learning.gradient, foreach=True)
         if torch.isfinite(norm):
             self.optimizer.step()
+        self.logged.append(Losses(*(value.detach() for value in told)))
 
     def _weights_now(self) -> LossWeights:
-        w = self.weights
+        w = self.learning.weights
         left = 1 - min(1.0, self.iteration / self.learning.iterations)
         return LossWeights(w.clip, w.value, w.entropy * left, w.mirror)
 

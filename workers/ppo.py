@@ -115,7 +115,7 @@ class BatchPPO(PPO):
             self.told = Iteration(0, self._expected(), np.empty((0, 4)), np.nan, (0.0, 0.0), {})
             return
         sampled = time.perf_counter()
-        results = self.learner_group.update(episodes=fragments, timesteps={}, **self._batches())
+        results = self.learner_group.update(episodes=fragments, timesteps={})
         self.metrics.aggregate(results, key="learners")
         steps = sum(map(len, fragments))
         live = sum(int(f.live.sum()) for f in fragments)
@@ -156,10 +156,6 @@ class BatchPPO(PPO):
 
     def _expected(self) -> int:
         return int(self.config.train_batch_size)
-
-    def _batches(self) -> dict[str, Any]:
-        c = self.config
-        return {"num_epochs": c.num_epochs, "minibatch_size": c.minibatch_size}
 
     def _sampled(self) -> list[Fragment]:
         """A fragment of each runner that answers, in their order."""
@@ -235,7 +231,7 @@ def _start(setup: Setup) -> BatchPPO:
             learner_class=MirrorLearner,
             learner_config_dict={"learning": setup.learning},
             train_batch_size=setup.samples,
-            minibatch_size=setup.learning.minibatch,
+            minibatch_size=None,  # MirrorLearner splits an iteration's samples
             num_epochs=1,  # FragmentsToBatch lays them out
             lr=setup.learning.rate,
             use_kl_loss=False,
