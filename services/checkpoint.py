@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pup.errors import InputError
 from pup.files import write_atomic
 
-SCHEMA = 1
+SCHEMA = 2
 META = "meta"
 
 

@@ -11,6 +11,7 @@ from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.columns import Columns
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pup.policy.gradients import differentiated
 from pup.policy.losses import Losses, LossWeights, Samples, TorchMirror, advantages, losses
@@ -180,7 +181,6 @@ class MirrorLearner(PPOTorchLearner):
         super().build()
         mirror = self.learning.mirror
         self.mirror = None if mirror is None else TorchMirror(mirror, self._device)
-        self.parameters = list(self.policy_module.policy.parameters())
         self.logged: list[Losses] = []
         self.iteration = 0
 
@@ -196,12 +196,15 @@ class MirrorLearner(PPOTorchLearner):
 
     def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
         """See Learner."""
-        parameters = self.get_parameters(self.module[module_id])
-        adam = torch.optim.Adam(parameters, lr=self.learning.rate, eps=1e-5, fused=True)
+        # One vector, of which the weights are views: Adam and the clip handle it at once.
+        self.parameters = list(self.policy_module.policy.parameters())
+        self.vector = parameters_to_vector(self.parameters).detach()
+        vector_to_parameters(self.vector, self.parameters)
+        adam = torch.optim.Adam([self.vector], lr=self.learning.rate, eps=1e-5, fused=True)
         self.register_optimizer(
             module_id=module_id,
             optimizer=adam,
-            params=parameters,
+            params=[self.vector],
             lr_or_lr_schedule=self.learning.rate,
         )
 
@@ -225,17 +228,16 @@ class MirrorLearner(PPOTorchLearner):
 
     def _step(self, samples: Samples, weights: LossWeights) -> None:
         """Descend by a minibatch; gradients that are no numbers move nothing."""
-        policy = self.policy_module.policy
+        given = self.policy_module.policy, samples, weights, self.mirror
         if self._device.type == "cpu":
-            told, gradients = differentiated(policy, samples, weights, self.mirror)
-            for parameter, gradient in zip(self.parameters, gradients, strict=True):
-                parameter.grad = gradient
+            told, gradients = differentiated(*given)
         else:
-            told = losses(policy, samples, weights, self.mirror)
-            self.optimizer.zero_grad()
-            told.total.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.learning.gradient, foreach=True)
+            told = losses(*given)
+            gradients = torch.autograd.grad(told.total, self.parameters)
+        gradient = torch.cat([one.flatten() for one in gradients])
+        norm = torch.linalg.vector_norm(gradient)
         if torch.isfinite(norm):
+            self.vector.grad = gradient.mul_((self.learning.gradient / norm).clamp(max=1.0))
             self.optimizer.step()
         self.logged.append(Losses(*(value.detach() for value in told)))
 
@@ -286,9 +288,8 @@ class MirrorLearner(PPOTorchLearner):
             f"policy/{k}": v.cpu().numpy().copy()
             for k, v in self.policy_module.policy.state_dict().items()
         }
-        for name, parameter in self.policy_module.policy.named_parameters():
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                told[f"adam/{key}/{name}"] = value.cpu().numpy().copy()
+        for key, value in self.optimizer.state.get(self.vector, {}).items():
+            told[f"adam/{key}"] = value.cpu().numpy().copy()
         told["rate"] = np.array(self.optimizer.param_groups[0]["lr"])
         told["iteration"] = np.array(self.iteration)
         return told
@@ -298,9 +299,8 @@ class MirrorLearner(PPOTorchLearner):
         policy = self.policy_module.policy
         weights = {k.removeprefix("policy/"): v for k, v in state.items() if k[:7] == "policy/"}
         load(policy, weights)
-        for name, parameter in policy.named_parameters():
-            for key in ("step", "exp_avg", "exp_avg_sq"):
-                value = torch.from_numpy(state[f"adam/{key}/{name}"].copy()).to(parameter.device)
-                self.optimizer.state[parameter][key] = value
+        for key in ("step", "exp_avg", "exp_avg_sq"):
+            value = torch.from_numpy(state[f"adam/{key}"].copy()).to(self.vector.device)
+            self.optimizer.state[self.vector][key] = value
         self.optimizer.param_groups[0]["lr"] = float(state["rate"])
         self.iteration = int(state["iteration"])
