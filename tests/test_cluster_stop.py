@@ -8,6 +8,7 @@ import time
 import pytest
 import ray
 
+from pup.errors import InputError
 from workers.cluster import connected, staying
 
 
@@ -38,3 +39,14 @@ def test_ray_stays_for_the_jobs_that_follow_and_not_longer() -> None:
                 seen.append(ray.get_runtime_context().get_node_id())
     assert seen[0] == seen[1]
     assert not ray.is_initialized()
+
+
+def test_a_machine_too_busy_for_ray_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray gives up after half a minute with an exception that has no kind of its own."""
+
+    def start(**_: object) -> None:
+        raise Exception("The current node timed out during startup. This could happen because")
+
+    monkeypatch.setattr(ray, "init", start)
+    with pytest.raises(InputError, match="busy"), connected(cores=1):
+        pass
