@@ -93,7 +93,7 @@ class TorchMirror:
 
     def observation(self, proprioception: Tensor) -> Tensor:
         """The mirrored robot's observation, same shape."""
-        return proprioception[:, self.entries] * self.signs
+        return proprioception.index_select(-1, self.entries) * self.signs
 
     def probabilities(self, told: Tensor) -> Tensor:
         """Mirrored probabilities, shape (n, bins, joints)."""
@@ -153,7 +153,11 @@ def with_mirrored(
         return seen, parameters, 0
     half = len(samples.log) // 2
     seen = torch.cat([seen, mirror.observation(seen[:half])])
-    return seen, torch.cat([parameters, parameters[:half, mirror.parameters]]), half
+    return (
+        seen,
+        torch.cat([parameters, parameters[:half].index_select(-1, mirror.parameters)]),
+        half,
+    )
 
 
 def advantages(
