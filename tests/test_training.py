@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -223,6 +224,18 @@ def test_training_outlives_a_runner(ray_here: None) -> None:
         assert np.array_equal(weights[0], weights[1])
         assert np.array_equal(weights[0], before)
         assert not np.array_equal(weights[0], trainer.weights()["actor.0.weight"])
+
+
+@pytest.mark.ray
+def test_a_training_that_ends_does_not_wait_for_its_samples(ray_here: None) -> None:
+    """A fragment of minutes is left where it is."""
+    trainer = Trainer(replace(TOY, sampling=replace(SAMPLING, steps=300_000)))
+    coming = trainer.algorithm.begin()
+    time.sleep(0.5)
+    begin = time.monotonic()
+    trainer.close()
+    assert time.monotonic() - begin < 10
+    assert isinstance(coming.exception(), CancelledError)
 
 
 # --- The job --------------------------------------------------------------------------------------

@@ -102,15 +102,15 @@ class BatchPPO(PPO):
 
     def cleanup(self) -> None:
         """See Algorithm."""
+        super().cleanup()  # stops what is being sampled
         self._thread.shutdown()
-        super().cleanup()
         self._folder.cleanup()
 
     def training_step(self) -> None:
         """See Algorithm."""
         begin = time.perf_counter()
         fragments = self.coming()
-        self._begin()
+        self.begin()
         if not fragments:
             self.told = Iteration(0, self._expected(), np.empty((0, 4)), np.nan, (0.0, 0.0), {})
             return
@@ -130,7 +130,7 @@ class BatchPPO(PPO):
 
     def coming(self) -> list[Fragment]:
         """What the coming iteration learns from; after this nothing is being sampled."""
-        coming = self._coming or self._begin()
+        coming = self._coming or self.begin()
         return coming.result()
 
     def bring(self, fragments: list[Fragment]) -> None:
@@ -143,7 +143,7 @@ class BatchPPO(PPO):
         if self._coming:
             wait([self._coming])
 
-    def _begin(self) -> Future[list[Fragment]]:
+    def begin(self) -> Future[list[Fragment]]:
         """Sample with the learner's weights of now, beside what this process does next."""
         super().restore_env_runners(self.env_runner_group)
         self._broadcast()
@@ -151,7 +151,7 @@ class BatchPPO(PPO):
         return self._coming
 
     def restore_env_runners(self, env_runner_group: Any) -> list[int]:
-        """Nothing: RLlib asks for it in the midst of sampling, `_begin` does it before."""
+        """Nothing: RLlib asks for it in the midst of sampling, `begin` does it before."""
         return []
 
     def _expected(self) -> int:

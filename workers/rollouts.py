@@ -1,6 +1,7 @@
 """Rollouts of a batched task, as a runner of RLlib: whole arrays, no Python per simulation."""
 
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -151,10 +152,15 @@ class Sampler:
         self.fragments = 0
         self.returns = np.zeros(self.task.n)
         self.now: Any = None
+        self._stopped = False
 
     @torch.no_grad()
     def sample(self, policy: ProjectedPolicy) -> Fragment:
-        """The next fragment."""
+        """The next fragment.
+
+        Raises:
+          CancelledError: another thread has called `stop`.
+        """
         task, steps = self.task, self.sampling.steps
         now = task.reset() if self.now is None else self.now
         # The seed is of the fragment, so that a training that goes on needs no generator's state.
@@ -171,6 +177,8 @@ class Sampler:
         flags = {name: np.empty(shape, dtype=bool) for name in ("terminated", "truncated", "live")}
         ended = []
         for t in range(steps):
+            if self._stopped:
+                raise CancelledError
             for name in names:
                 seen[name][t] = getattr(now, name)
             logits = policy(
@@ -189,6 +197,10 @@ class Sampler:
         self.now = now
         self.fragments += 1
         return Fragment(**seen, bins=bins, **told, **flags, ended=np.concatenate(ended))
+
+    def stop(self) -> None:
+        """Have no more steps done."""
+        self._stopped = True
 
     def _ended(self, step: Step) -> NDArray[np.float64]:
         self.returns += step.reward
@@ -249,6 +261,11 @@ class BatchRunner(EnvRunner, Checkpointable):
         self.metrics.log_value(NUM_ENV_STEPS_SAMPLED, len(fragment), reduce="sum")
         self.metrics.log_value(NUM_ENV_STEPS_SAMPLED_LIFETIME, len(fragment), reduce="lifetime_sum")
         return [fragment]
+
+    def stop(self) -> None:
+        """See EnvRunner."""
+        if self.sampler:
+            self.sampler.stop()
 
     def get_metrics(self) -> Any:
         """See EnvRunner."""
