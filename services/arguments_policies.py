@@ -131,6 +131,13 @@ def replay(verb: argparse.ArgumentParser) -> None:
         metavar="N",
         help="walk N etas on 16 draws of the parameters, for pup transfer --simulated",
     )
+    walk.add_argument(
+        "--study",
+        type=Path,
+        metavar="FILE",
+        help="study.json of pup transfer: make the walks of its trials again in simulation "
+        "instead, and compare; writes rehearsal.json and rehearsal.png",
+    )
     seed(walk)
 
 

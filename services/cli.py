@@ -84,9 +84,13 @@ def _show_service(shown: dict[str, Any]) -> None:
 
 
 def _show_replay(shown: dict[str, Any]) -> None:
+    from services.rehearsal import rehearsal_words
     from services.tables import replay_table, walk_table
 
-    (walk_table if "policy" in shown else replay_table)(shown)
+    if "etas" in shown:
+        print(rehearsal_words(shown))
+    else:
+        (walk_table if "policy" in shown else replay_table)(shown)
 
 
 def _show_blind(shown: dict[str, Any]) -> None:

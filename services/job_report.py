@@ -13,6 +13,7 @@ from pup.files import write_atomic
 from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, as_svg, drawing_style, new_figure
 from pup.sysid.html import Column, Drawing, Html, figure, page, table, tag
 from services.diagnosis import CORRECTED
+from services.rehearsal import rehearsal_figure, rehearsal_words
 from services.stages import Done
 
 TITLES = {
@@ -21,6 +22,7 @@ TITLES = {
     "train": "Training",
     "walk": "Walk in simulation",
     "transfer": "Walks of the virtual robot",
+    "rehearsal": "Walks of the robot, made again in simulation",
     "diagnosis": "What the simulator leaves out",
     CORRECTED: "The same with the robot as it was found to be",
 }
@@ -75,6 +77,7 @@ def found(documents: Mapping[str, Any]) -> dict[str, str]:
         "train": _training_words,
         "walk": _walk_words,
         "transfer": _transfer_words,
+        "rehearsal": rehearsal_words,
         "diagnosis": _diagnosis_words,
     }
     return {name: words[_parts(name)[1]](document) for name, document in documents.items()}
@@ -161,6 +164,7 @@ def _content(job: Job) -> Iterator[Html]:
         "train": _train,
         "walk": _walk,
         "transfer": _transfer,
+        "rehearsal": _rehearsal,
         "diagnosis": _diagnosis,
     }
     for name, document in job.documents.items():
@@ -186,6 +190,9 @@ def _facts(job: Job) -> Iterator[Html]:
         if tried := told.get(f"{half}transfer"):
             yield _fact(f"Virtual robot, chosen eta{of}", spread(tried["chosen"]), "")
             yield _fact(f"Virtual robot, eta fitted{of}", spread(tried["fitted"]), "no trials")
+        if again := told.get(f"{half}rehearsal"):
+            walked = f"{again['distance']:.2f} m by the robot"
+            yield _fact(f"Its walks, simulated{of}", f"{again['simulated_distance']:.2f} m", walked)
 
 
 def _fact(name: str, value: str, more: str) -> Html:
@@ -272,6 +279,16 @@ def _transfer(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
         for w in told["walks"]
     ]
     yield table("All walks", columns, rows)
+
+
+def _rehearsal(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:
+    yield tag("p", f"{rehearsal_words(told)}.")
+    yield figure(
+        as_svg(rehearsal_figure(told)),
+        "Distances in simulation over those of the robot, a dot for each eta.",
+        "A dot for each eta that the robot walked by the first half's policy; line: where both "
+        "walk alike. Bars: standard errors of the simulated means.",
+    )
 
 
 def _diagnosis(job: Job, told: Mapping[str, Any], half: str) -> Iterator[Html]:

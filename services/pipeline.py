@@ -25,7 +25,7 @@ from services.stages import Journal, Stage, content
 POLICIES = "policies"
 """Folder of a built-in robot with a bundle for each direction."""
 DIRECTION = "forward"
-ORDER = "presysid", "replay", "train", "walk", "transfer"
+ORDER = "presysid", "replay", "train", "walk", "transfer", "rehearsal"
 """Of a half's stages where they are told of."""
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
 FURTHER_RATE = 2e-4
@@ -121,6 +121,7 @@ class _Job:
             shown = (self._replay, self._walk)
             drawn = [aside.submit(self._do, make(half), done) for make in shown]
             self._do(self._transfer(half), done)
+            self._do(self._rehearsal(half), done)
             for picture in drawn:
                 picture.result()
         self.documents |= {name: done[name] for name in map(half.stage, ORDER) if name in done}
@@ -234,6 +235,25 @@ class _Job:
         names = "transfer.json", "study.json"
         files = [half.at(f"transfer/{name}") for name in names]
         return self._alone(half, "transfer", used, files, work)
+
+    def _rehearsal(self, half: Half) -> Stage | None:
+        """The first walks of the robot, by the policy that made them, in this half's simulator."""
+        if not self.trials:
+            return None
+        from services.rehearsal import FILE, PICTURE, rehearse
+
+        seed, study = self.mission.presysid.seed, "transfer/study.json"
+        policy = self.out / POLICY if self.steps else self.shipped
+        bounds, out = self.out / half.at(BOUNDS), self.out / half.at("rehearsal")
+
+        def work() -> None:
+            threads = self.means.threads
+            rehearse(half.robot, policy, bounds, self.out / study, out, seed, threads)
+
+        inputs = _described(half) | self._hash(half.at(BOUNDS), study)
+        inputs |= {"policy": sha256(policy / CARD), "seed": str(seed)}
+        files = [half.at(f"rehearsal/{name}") for name in (FILE, PICTURE)]
+        return self._alone(half, "rehearsal", inputs, files, work)
 
     def _diagnosis(self) -> Stage:
         from services.diagnosis import DIAGNOSIS as TOLD

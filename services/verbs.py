@@ -151,6 +151,8 @@ def _service() -> None:
 def _replay(options: argparse.Namespace) -> dict[str, Any]:
     if bool(options.recordings) == bool(options.policy):
         raise InputError("give either recordings or --policy DIR")
+    if options.study and not options.policy:
+        raise InputError("--study needs the policy that walked; give it with --policy DIR")
     if options.policy and options.engine != "mujoco":
         raise InputError(f"--engine {options.engine} replays recordings; a policy walks in mujoco")
     if options.policy:
@@ -170,6 +172,8 @@ def _walk(options: argparse.Namespace) -> dict[str, Any]:
     from services.walk import Shown, walk
 
     robot = RobotDescription.load(options.robot)
+    if options.study:
+        return _rehearse(robot, options)
     shown = Shown(
         options.policy,
         options.bounds,
@@ -180,6 +184,16 @@ def _walk(options: argparse.Namespace) -> dict[str, Any]:
     )
     with _folder(options.out) as out:
         return walk(robot, shown, out, places.cores(options))
+
+
+def _rehearse(robot: RobotDescription, options: argparse.Namespace) -> dict[str, Any]:
+    from services.rehearsal import rehearse
+
+    if options.eta is not None or options.landscape:
+        raise InputError("--study walks the etas of its trials; leave out --eta and --landscape")
+    bounds, cores = options.bounds or robot.identified_path, places.cores(options)
+    with _folder(options.out) as out:
+        return rehearse(robot, options.policy, bounds, options.study, out, options.seed, cores)
 
 
 def _diagnose(options: argparse.Namespace) -> dict[str, Any]:

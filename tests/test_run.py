@@ -132,13 +132,13 @@ def check_result(told: dict[str, Any], out: Path) -> None:
     """What is printed, the journal and the report tell the same."""
     assert told["transfer"] == json.loads((out / "transfer" / "transfer.json").read_text())
     assert told["left_out"] == {"train": "as told", "diagnosis": "as told"}
-    assert told["took"].keys() == {"presysid", "replay", "transfer"}
+    assert told["took"].keys() == {"presysid", "replay", "transfer", "rehearsal"}
     page = Page(out / "report.html")
     assert not {"script", "link", "iframe"} & {name for name, _ in page.elements}
     sources = [attributes["src"] for name, attributes in page.elements if name == "img"]
     assert sources and all(source.startswith("data:image/") for source in sources)
     stages = json.loads((out / "run.json").read_text())["stages"]
-    for stage in ("presysid", "replay", "transfer"):
+    for stage in ("presysid", "replay", "transfer", "rehearsal"):
         for name, digest in stages[stage]["files"].items():
             assert sha256(out / name) == digest
             assert digest in page.text and name in page.text
