@@ -1,13 +1,12 @@
 """The plot of a training's curve."""
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pup.files import write_atomic
-from pup.sysid.figures import BLUE, drawing_style, new_figure
+from pup.sysid.figures import BLUE, as_png, drawing_style, new_figure
 
 PANELS = (
     ("distance", "distance at the end of an episode, m"),
@@ -37,6 +36,4 @@ def draw_curve(file: Path, document: dict[str, Any]) -> None:
             f"{document['robot']}, {document['method']}, {document['direction']}: "
             f"{document['steps'] / 1e6:.1f} M steps in {document['seconds'] / 60:.0f} min"
         )
-        packed = io.BytesIO()
-        figure.savefig(packed, format="png", dpi=120)
-    write_atomic(file, packed.getvalue())
+        write_atomic(file, as_png(figure))

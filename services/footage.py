@@ -20,7 +20,7 @@ from pup.locomotion.evaluation import Policy
 from pup.locomotion.task import WalkingTask
 from pup.physics.model import FLOOR, compile_model
 from pup.robot import RobotDescription
-from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, drawing_style, new_figure
+from pup.sysid.figures import BLUE, INK, SOFT, VERMILLION, as_png, drawing_style, new_figure
 from services import stopping
 
 Array = NDArray[np.float64]
@@ -150,9 +150,7 @@ def draw_gait(file: Path, robot: RobotDescription, footage: Footage) -> None:
             + (", then a fall" if footage.fell else "")
             + "; left limbs red, each figure moved to the right of the one before"
         )
-        packed = io.BytesIO()
-        figure.savefig(packed, format="png", dpi=120)
-    write_atomic(file, packed.getvalue())
+        write_atomic(file, as_png(figure))
 
 
 def _draw_sticks(axes: Any, sticks: list[tuple[Array, Array, str]], shift: float) -> None:

@@ -6,7 +6,6 @@ trials came to, and what the same etas come to in simulation, tells it before an
 there (the correlation is Kadian et al. 2020's, of ranks).
 """
 
-import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
-from pup.sysid.figures import INK, SOFT, drawing_style, new_figure
+from pup.sysid.figures import INK, SOFT, as_png, drawing_style, new_figure
 from pup.sysid.result import read_bounds
 from pup.transfer.study import TrialState
 
@@ -107,9 +106,7 @@ def rehearse(
     }
     write_json(out / FILE, document)
     with drawing_style():
-        packed = io.BytesIO()
-        rehearsal_figure(document).savefig(packed, format="png", dpi=120)
-    write_atomic(out / PICTURE, packed.getvalue())
+        write_atomic(out / PICTURE, as_png(rehearsal_figure(document)))
     return document
 
 

@@ -74,6 +74,13 @@ def new_figure(width: float, height: float, *, fixed: bool = False) -> Any:
     return figure
 
 
+def as_png(figure: Any) -> bytes:
+    """The figure as PNG, the same bytes every time."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
+    return buffer.getvalue()
+
+
 def as_svg(figure: Any) -> Drawing:
     """The figure as SVG, the same bytes every time."""
     buffer = io.BytesIO()

@@ -1,6 +1,5 @@
 """Real against simulated motion: the panels of the report and the plots of `pup replay`."""
 
-import io
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from pup.physics.simulator import Trajectories
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import Accuracy, JointUnits, accuracy
-from pup.sysid.figures import INK, SOFT, as_svg, drawing_style, line_style, new_figure
+from pup.sysid.figures import INK, SOFT, as_png, as_svg, drawing_style, line_style, new_figure
 from pup.sysid.html import Drawing
 from pup.sysid.loss import ReplayLoss
 from pup.sysid.wording import counted, thousandths
@@ -309,6 +308,4 @@ def _picture(overlays: Overlays, i: int, label: str) -> bytes:
     )  # fmt: skip
     figure.supxlabel("time [s]", fontsize=9)
     figure.supylabel(f"position [{units.position}]", fontsize=9)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
+    return as_png(figure)
