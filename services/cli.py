@@ -84,10 +84,11 @@ def _show_service(shown: dict[str, Any]) -> None:
 
 
 def _show_replay(shown: dict[str, Any]) -> None:
-    from services.rehearsal import rehearsal_words
     from services.tables import replay_table, walk_table
 
     if "etas" in shown:
+        from services.rehearsal import rehearsal_words
+
         print(rehearsal_words(shown))
     else:
         (walk_table if "policy" in shown else replay_table)(shown)

@@ -224,7 +224,7 @@ class _Job:
 
         mission, seed = self.mission, self.mission.presysid.seed
         budget = Budget(self.trials, mission.least_gain, mission.repeats, seed)
-        policy = self.out / half.at(POLICY) if self.steps else self.shipped
+        policy = self._walker(half)
         bounds, out = self.out / half.at(BOUNDS), self.out / half.at("transfer")
 
         def work() -> None:
@@ -236,6 +236,10 @@ class _Job:
         files = [half.at(f"transfer/{name}") for name in names]
         return self._alone(half, "transfer", used, files, work)
 
+    def _walker(self, half: Half) -> Path:
+        """The policy that walks in a half's trials."""
+        return self.out / half.at(POLICY) if self.steps else self.shipped
+
     def _rehearsal(self, half: Half) -> Stage | None:
         """The first walks of the robot, by the policy that made them, in this half's simulator."""
         if not self.trials:
@@ -243,7 +247,7 @@ class _Job:
         from services.rehearsal import FILE, PICTURE, rehearse
 
         seed, study = self.mission.presysid.seed, "transfer/study.json"
-        policy = self.out / POLICY if self.steps else self.shipped
+        policy = self._walker(self.first)
         bounds, out = self.out / half.at(BOUNDS), self.out / half.at("rehearsal")
 
         def work() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
+from scipy.stats import spearmanr
 
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_atomic, write_json
@@ -82,8 +82,8 @@ def rehearse(
     Raises:
       InputError: the policy is not this robot's, or the study is none of this policy.
     """
-    bundle = NumpyPolicy.load(policy, robot)
-    walked = read_walked(study, bundle, sha256(policy / CARD))
+    bundle, digest = NumpyPolicy.load(policy, robot), sha256(policy / CARD)
+    walked = read_walked(study, bundle, digest)
     fitted = read_bounds(bounds, robot)
     task = TaskSettings(direction=Direction(bundle.card.direction)).evaluation()
     task = replace(task, horizon=walked.horizon)
@@ -98,7 +98,7 @@ def rehearse(
         "robot": robot.name,
         "robot_digest": robot.digest,
         "study_sha256": sha256(study),
-        "policy_sha256": sha256(policy / CARD),
+        "policy_sha256": digest,
         "bounds_sha256": sha256(bounds),
         "episodes": EPISODES,
         "etas": _etas(walked, distance, time),
@@ -179,12 +179,9 @@ def _summary(walked: Walked, distance: Array, time: Array) -> dict[str, Any]:
 
 def _rank_correlation(one: Array, other: Array) -> float | None:
     """Spearman's; None of fewer than three etas, or where all are alike."""
-    if len(one) < 3:
+    if len(one) < 3 or np.ptp(one) == 0 or np.ptp(other) == 0:
         return None
-    ranks = np.stack([rankdata(one), rankdata(other)])
-    if (ranks.std(axis=1) == 0).any():
-        return None
-    return float(np.corrcoef(ranks)[0, 1])
+    return float(spearmanr(one, other).statistic)
 
 
 def rehearsal_words(told: Mapping[str, Any]) -> str:

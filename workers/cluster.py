@@ -134,29 +134,33 @@ def _embedded(cores: int | None) -> Iterator[None]:
     folder = mkdtemp(prefix="pup-ray-")
     watch = reaper.start(folder)
     try:
-        try:
-            with _own_signals(), _loopback():
-                ray.init(
-                    address="local",
-                    num_cpus=cores,
-                    include_dashboard=False,
-                    log_to_driver=False,
-                    logging_level=logging.ERROR,
-                    object_store_memory=OBJECT_STORE,
-                    _temp_dir=folder,
-                    _node_ip_address="127.0.0.1",
-                )
-        except Exception as error:  # Ray has no kind of its own for it
-            if "timed out during startup" not in str(error):
-                raise
-            raise InputError(
-                "Ray did not start within half a minute: this machine is busy with something else, "
-                "or out of memory; repeat the command when it is not, or give --address"
-            ) from error
+        _start(cores, folder)
         yield
     finally:
         ray.shutdown()
         reaper.close(watch, folder)
+
+
+def _start(cores: int | None, folder: str) -> None:
+    try:
+        with _own_signals(), _loopback():
+            ray.init(
+                address="local",
+                num_cpus=cores,
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                object_store_memory=OBJECT_STORE,
+                _temp_dir=folder,
+                _node_ip_address="127.0.0.1",
+            )
+    except Exception as error:  # Ray has no kind of its own for it
+        if "timed out during startup" not in str(error):
+            raise
+        raise InputError(
+            "Ray did not start within half a minute: this machine is busy with something else, "
+            "or out of memory; repeat the command when it is not, or give --address"
+        ) from error
 
 
 @contextmanager

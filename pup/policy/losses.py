@@ -153,11 +153,8 @@ def with_mirrored(
         return seen, parameters, 0
     half = len(samples.log) // 2
     seen = torch.cat([seen, mirror.observation(seen[:half])])
-    return (
-        seen,
-        torch.cat([parameters, parameters[:half].index_select(-1, mirror.parameters)]),
-        half,
-    )
+    mirrored = parameters[:half].index_select(-1, mirror.parameters)
+    return seen, torch.cat([parameters, mirrored]), half
 
 
 def advantages(
