@@ -24,7 +24,7 @@ def differentiated(
       The losses, and a gradient for each of the policy's parameters in their order.
     """
     count, joints = len(samples.log), policy.shape.joints
-    seen, parameters, half = with_mirrored(samples, weights, mirror)
+    seen, parameters, few = with_mirrored(samples, weights, mirror)
     seen = policy.observations(seen)
     projected, eta = [], policy.conditions(parameters)
     if policy.shape.latent:
@@ -43,12 +43,12 @@ def differentiated(
         own -= chance[:count] * own.sum(dim=-2, keepdim=True)
         slope[:count].add_(own, alpha=weights.entropy / (count * joints))
     apart = log.new_zeros(())
-    if mirror is not None and half:
-        off = chance[count:] - mirror.probabilities(chance[:half])
-        apart = off.square().sum() / (half * joints)
-        off *= 2 * weights.mirror / (half * joints)
+    if mirror is not None and few:
+        off = chance[count:] - mirror.probabilities(chance[:few])
+        apart = off.square().sum() / (few * joints)
+        off *= 2 * weights.mirror / (few * joints)
         slope[count:] = _by_logits(off, chance[count:])
-        slope[:half] -= _by_logits(mirror.probabilities(off), chance[:half])
+        slope[:few] -= _by_logits(mirror.probabilities(off), chance[:few])
     known = policy.privileged(samples.true_parameters)
     judged = _forward(policy.critic, torch.cat([seen[:count], known], dim=-1))
     error = judged[-1] - samples.returns[:, None]
@@ -99,9 +99,14 @@ def _forward(layers: torch.nn.Sequential, inputs: Tensor) -> list[Tensor]:
     told = [inputs]
     for layer in islice(layers, 0, None, 2):
         if len(told) > 1:
-            told[-1].tanh_()
+            _bend(told[-1])
         told.append(torch.addmm(layer.bias, told[-1], layer.weight.t()))
     return told
+
+
+def _bend(values: Tensor) -> None:
+    """Their tanh, in place; a processor makes exponentials in half the time of tanh."""
+    values.mul_(2).sigmoid_().mul_(2).sub_(1)
 
 
 def _backward(

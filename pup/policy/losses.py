@@ -12,6 +12,8 @@ from pup.policy.mirror import MirrorMap
 from pup.policy.network import ProjectedPolicy, log_probability
 
 Array = NDArray[np.float32]
+MIRRORED = 4
+"""One sample in so many is mirrored."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +119,15 @@ class _Exchange(torch.autograd.Function):
 def losses(
     policy: ProjectedPolicy, samples: Samples, weights: LossWeights, mirror: TorchMirror | None
 ) -> Losses:
-    """PPO's losses of a minibatch, and the mirror loss of half of it."""
+    """PPO's losses of a minibatch, and the mirror loss of some of it."""
     count = len(samples.log)
-    seen, parameters, half = with_mirrored(samples, weights, mirror)
+    seen, parameters, few = with_mirrored(samples, weights, mirror)
     whole = torch.log_softmax(policy(seen, parameters), dim=-2)
-    log, other = whole.split([count, half])
+    log, other = whole.split([count, few])
     apart = whole.new_zeros(())
-    if mirror is not None and half:
-        off = other.exp() - mirror.probabilities(log[:half].exp())
-        apart = off.square().sum() / (half * policy.shape.joints)
+    if mirror is not None and few:
+        off = other.exp() - mirror.probabilities(log[:few].exp())
+        apart = off.square().sum() / (few * policy.shape.joints)
     change = log_probability(log, samples.bins) - samples.log
     ratio = change.exp()
     kept = ratio.clamp(1 - weights.clip, 1 + weights.clip)
@@ -146,15 +148,15 @@ def with_mirrored(
 ) -> tuple[Tensor, Tensor, int]:
     """Observations and mu, then those of mirrored samples, and how many these are.
 
-    Half of the samples are mirrored, which are shuffled: enough for a tendency, at half the price.
+    A share of the samples is mirrored, which are shuffled: enough for a tendency, and cheaper.
     """
     seen, parameters = samples.proprioception, samples.parameters
     if mirror is None or weights.mirror <= 0:
         return seen, parameters, 0
-    half = len(samples.log) // 2
-    seen = torch.cat([seen, mirror.observation(seen[:half])])
-    mirrored = parameters[:half].index_select(-1, mirror.parameters)
-    return seen, torch.cat([parameters, mirrored]), half
+    few = len(samples.log) // MIRRORED
+    seen = torch.cat([seen, mirror.observation(seen[:few])])
+    mirrored = parameters[:few].index_select(-1, mirror.parameters)
+    return seen, torch.cat([parameters, mirrored]), few
 
 
 def advantages(
