@@ -86,10 +86,10 @@ def found(documents: Mapping[str, Any]) -> dict[str, str]:
 def _bounds_words(told: Mapping[str, Any]) -> str:
     known = [p["identified"] for p in told["parameters"]]
     train = told["loss"]["train"]
-    return (
-        f"{len(known)} parameters, {sum(known)} determined by the recordings; "
-        f"loss {train['loss_before']:.3g} before, {train['loss']:.3g} after"
-    )
+    words = f"{len(known)} parameters, {sum(known)} determined by the recordings; "
+    if told["provenance"]["options"].get("as_described"):
+        return words + f"values of the diagnosis, loss {train['loss']:.3g}"
+    return words + f"loss {train['loss_before']:.3g} before, {train['loss']:.3g} after"
 
 
 def _replay_words(told: Mapping[str, Any]) -> str:

@@ -119,6 +119,12 @@ def budget(
         metavar="FILE",
         help=f"bounds.json or identified.json where the nominal fit begins; default: {start}",
     )
+    budget.add_argument(
+        "--as-described",
+        action="store_true",
+        help="keep the values of robot.toml, such as a diagnosis leaves them, and look for the "
+        "bounds around them",
+    )
     seed(budget)
 
 

@@ -148,12 +148,12 @@ class _Job:
         first = self.mission.presysid
         options = replace(
             first,
-            generations=_half(first.generations),
             subset_generations=_half(first.subset_generations),
+            folds=0,
             actuator="pd",  # as it was diagnosed: what was found is missing beside PD servos
             compare=False,
             start=None,
-            near=True,
+            as_described=True,  # the diagnosis has fitted it, to more than these recordings
         )
         return Half(robot, options, CORRECTED)
 

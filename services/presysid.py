@@ -54,7 +54,8 @@ class Options:
       seed: of everything random.
       start: bounds file whose fitted values stand in for those of the robot's description: fits of
         its torque law begin there, and what the recordings cannot see stays there.
-      near: whether the description's values are fitted ones, so that fits begin with small steps.
+      as_described: whether the description's values are fitted ones, such as a diagnosis leaves
+        them: they stay the nominal ones, and bounds alone are sought.
     """
 
     actuator: Actuator = "nn_pd"
@@ -68,7 +69,7 @@ class Options:
     fixed_network: bool = False
     seed: int = 0
     start: Path | None = None
-    near: bool = False
+    as_described: bool = False
 
     def told(self) -> dict[str, Any]:
         """As files have it: a file is known by its content, wherever it lies."""
@@ -120,6 +121,8 @@ class _Job:
                 f"{options.folds} folds for {len(recordings)} recordings; use 2 to their number, "
                 "for each fold leaves some out and keeps some, or 0 for none"
             )
+        if options.as_described and (options.folds or options.start is not None):
+            raise InputError("values that are kept as described take no folds and no start")
         self.robot, self.recordings, self.options = robot, recordings, options
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
         compared: tuple[Actuator, ...] = (robot.actuator, "pd") if options.compare else ()
@@ -180,6 +183,8 @@ class _Job:
 
     def _nominal(self, full: dict[Actuator, Problem]) -> dict[tuple[str, Actuator], FitResult]:
         """The nominal fit and the folds' fits of each torque law."""
+        if self.options.as_described:
+            return {("nominal", a): _described(problem) for a, problem in full.items()}
         fits: dict[tuple[str, Actuator], Fit] = {}
         for actuator, problem in full.items():
             fits["nominal", actuator] = self._fit_of_all(f"nominal_{actuator}", problem)
@@ -191,8 +196,7 @@ class _Job:
     def _fit_of_all(self, name: str, problem: Problem) -> Fit:
         o = self.options
         start = problem.free_space.normalise(problem.free_space.nominal)
-        near = problem.actuator in self.known or o.near
-        sigma = NEAR_SIGMA if near else FAR_SIGMA
+        sigma = NEAR_SIGMA if problem.actuator in self.known else FAR_SIGMA
         return Fit(name, problem, FitSettings(start, sigma, o.population, o.generations, o.seed))
 
     def _folds(self) -> list[tuple[int, ...]]:
@@ -323,6 +327,12 @@ class _Job:
 def _movable(space: ParameterSpace) -> list[str]:
     """The parameters of the nominal model; the description's terms stay as they are."""
     return [name for name in space.names if split_column(name) is None]
+
+
+def _described(problem: Problem) -> FitResult:
+    """The description's values, as a fit would tell them."""
+    start = problem.free_space.normalise(problem.free_space.nominal)
+    return FitResult(start, float(problem.losses(start[None])[0]), np.empty(0))
 
 
 def _short(*parts: object) -> str:

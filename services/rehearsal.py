@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 SCHEMA = 1
 FILE, PICTURE = "rehearsal.json", "rehearsal.png"
 EPISODES = 8
-"""Of each eta: readings are noisy, and the IMU's error is drawn for each."""
+"""Of each eta: readings are noisy, and the control rate is drawn for each."""
 SHORT = 0.5
 """Share of the robot's time before a fall below which a simulator does not walk as it does."""
 
@@ -86,7 +86,8 @@ def rehearse(
     walked = read_walked(study, bundle, digest)
     fitted = read_bounds(bounds, robot)
     task = TaskSettings(direction=Direction(bundle.card.direction)).evaluation()
-    task = replace(task, horizon=walked.horizon)
+    # The error of an IMU is drawn anew for each walk in a training; a robot has the one it has.
+    task = replace(task, horizon=walked.horizon, tilt_bias=0.0)
     eta = np.repeat(walked.eta, EPISODES, axis=0)
     rng = np.random.default_rng(seed)
     mu = ParameterSampler.nominal(fitted).draw(rng, np.arange(len(eta)))

@@ -25,12 +25,15 @@ def bounds_table(document: dict[str, Any], unit: str) -> None:
         table.add_row(p["name"], *numbers, p["unit"], "yes" if p["identified"] else "no")
     console.print(table)
     train, held = document["loss"]["train"], document["loss"]["held_out"]
-    console.print(
-        f"loss {train['loss_before']:.3g} before, {train['loss']:.3g} after the fit; "
-        f"RMSE {train['rmse_before']:.3g} {unit} before, {train['rmse']:.3g} {unit} after"
-        + (f", {held['rmse']:.3g} {unit} held out" if held else ""),
-        soft_wrap=True,
-    )
+    if document["provenance"]["options"].get("as_described"):
+        words = f"as described: loss {train['loss']:.3g}, RMSE {train['rmse']:.3g} {unit}"
+    else:
+        words = (
+            f"loss {train['loss_before']:.3g} before, {train['loss']:.3g} after the fit; "
+            f"RMSE {train['rmse_before']:.3g} {unit} before, {train['rmse']:.3g} {unit} after"
+        )
+    words += f", {held['rmse']:.3g} {unit} held out" if held else ""
+    console.print(words, soft_wrap=True)
     console.print(f"{document['provenance']['seconds']:.0f} s")
 
 

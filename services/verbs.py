@@ -328,6 +328,7 @@ def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
         fixed_network=options.fixed_network,
         seed=options.seed,
         start=options.start,
+        as_described=options.as_described,
     )
 
 

@@ -10,6 +10,7 @@ from commandline import files, pup
 from jobs import Job
 
 from pup.files import sha256
+from pup.physics.parameters import robot_space
 from pup.recording import write_recordings
 from pup.robot import RobotDescription
 from tests.reports import Page
@@ -63,6 +64,17 @@ def test_what_is_missing_is_found_and_the_corrected_robot_replays_better(
     robot = RobotDescription.load(str(whole / "diagnosis" / "corrected"))
     digest = told["corrected-presysid"]["provenance"]["robot_digest"]
     assert robot.terms and digest == robot.digest
+
+
+def test_the_values_of_the_diagnosis_stay_and_bounds_are_found_around_them(whole: Path) -> None:
+    robot = RobotDescription.load(str(whole / "diagnosis" / "corrected"))
+    space = robot_space(robot, "pd")
+    described = dict(zip(space.names, space.nominal, strict=True))
+    told = json.loads((whole / "corrected/presysid/bounds.json").read_text())
+    for p in told["parameters"]:
+        assert p["nominal"] == pytest.approx(described[p["name"]], rel=1e-12)
+        assert p["lower"] <= p["nominal"] <= p["upper"] and p["lower"] < p["upper"]
+    assert told["loss"]["train"]["loss"] == told["loss"]["train"]["loss_before"]
 
 
 def test_the_report_ties_both_halves_to_their_inputs(whole: Path) -> None:

@@ -122,7 +122,9 @@ class _Report:
     def before(self) -> str:
         """The error at the robot's nominal values, where it is known."""
         before = self.bounds.train.get("rmse_before")
-        return "" if before is None else f"before the fit: {self.units.words(before)}"
+        if before is None or before == self.bounds.train["rmse"]:
+            return ""
+        return f"before the fit: {self.units.words(before)}"
 
     def left_out(self) -> tuple[str, str]:
         """The error on recordings that a fit did not see, and how it was measured."""
@@ -159,11 +161,12 @@ class _Report:
         )
         yield tag(
             "p",
-            "Nominal: the fit to all recordings. Lower and upper: the range of this and of the "
-            "fits to random subsets, 10 % wider at both ends, and widened towards an interval that "
-            "holds all parameters at once in 95 % of cases, by a twentieth of the search range at "
-            "most; the whole search range where the recordings tell next to nothing. 90 % "
-            "interval: how far the nominal fit is determined if the model is right.",
+            "Nominal: the fit to all recordings, or the values that were kept. Lower and "
+            "upper: the range of this and of the fits to random subsets, 10 % wider at both ends, "
+            "and widened towards an interval that holds all parameters at once in 95 % of cases, "
+            "by a twentieth of the search range at most; the whole search range where the "
+            "recordings tell next to nothing. 90 % interval: how far the nominal fit is "
+            "determined if the model is right.",
         )
         if any(wording.at_edge(bounds)):
             yield tag(

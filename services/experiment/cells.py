@@ -186,7 +186,9 @@ class _Graph:
             refit = f"presysid-r{seed}-corrected"
             if refit not in self._cells:
                 # PD servos: what a diagnosis finds is missing beside these.
-                fits = replace(self.plan.presysid, actuator="pd", compare=False, near=True)
+                fits = replace(
+                    self.plan.presysid, actuator="pd", compare=False, folds=0, as_described=True
+                )
                 told = self._fitted(fits)
                 needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
                 weight = self._cells[f"presysid-r{seed}"].weight
