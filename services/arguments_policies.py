@@ -17,13 +17,12 @@ from services.options import (
 
 TRAINING = (
     ("--steps", (1000, 10**11), int, 10_000_000, "control steps of all simulations together"),
-    ("--simulations", (1, 65536), int, 256, "at once, of each process that simulates"),
-    ("--length", (2, 4096), int, 80, "control steps of each simulation between two updates"),
+    ("--simulations", (1, 65536), int, 128, "at once, of each process that simulates"),
+    ("--length", (2, 4096), int, 40, "control steps of each simulation between two updates"),
     ("--epochs", (1, 100), int, 5, "passes over the samples of an update"),
     ("--minibatch", (16, 2**20), int, 256, "samples of a gradient step"),
     ("--learning-rate", (1e-7, 1.0), float, 3e-4, "at the beginning"),
     ("--entropy", (0.0, 10.0), float, 0.0, "weight of exploration, falling to 0"),
-    ("--sharpen", (0.1, 10.0), float, 1.0, "by which exploration falls besides what is learnt"),
     ("--mirror", (0.0, 1000.0), float, 1.0, "weight of left-right symmetry; never sideways"),
 )
 """Numbers of a training: option, limits, kind, default and what it is."""
@@ -68,6 +67,12 @@ def train(verb: argparse.ArgumentParser) -> None:
             metavar="N" if kind is int else "X",
             help=f"{told}; default: %(default)s",
         )
+    policy.add_argument(
+        "--sharpen",
+        type=number(0.1, 10.0, float),
+        metavar="X",
+        help="by which exploration falls besides what is learnt; default: 4 from scratch, else 1",
+    )
     policy.add_argument(
         "--schedule",
         choices=("linear", "adaptive", "constant"),

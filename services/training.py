@@ -42,8 +42,10 @@ CHECKPOINT_SECONDS = 30.0
 ROBOTS_A_THREAD = 64
 """Fewer wait longer for each other than they save: 256 robots on 16 cores take 5,000 steps a second
 on 16 threads and 8,100 on 4 (docs/results/training.md)."""
-SMOOTHED = 10
+SMOOTHED = 40
 """Iterations whose mean return says which weights were best so far."""
+SHARPEN = 4.0
+"""By which exploration falls in a training from scratch; one that goes on explores as it did."""
 ETAS = 20_000
 """Draws of mu whose projections span eta's box."""
 
@@ -74,8 +76,8 @@ class Options:
     direction: Direction = Direction.FORWARD
     steps: int = 10_000_000
     seed: int = 0
-    simulations: int = 256
-    length: int = 80
+    simulations: int = 128
+    length: int = 40
     learning: Learning = field(default_factory=Learning)
     runners: int = 0
     start: Path | None = None
@@ -114,13 +116,14 @@ def train(
 def training_options(given: argparse.Namespace) -> Options:
     """What `pup train` was told."""
     weights = LossWeights(entropy=given.entropy, mirror=given.mirror)
+    usual = SHARPEN if given.start is None else 1.0
     learning = Learning(
         epochs=given.epochs,
         minibatch=given.minibatch,
         rate=given.learning_rate,
         schedule=given.schedule,
         weights=weights,
-        sharpen=given.sharpen,
+        sharpen=usual if given.sharpen is None else given.sharpen,
     )
     return Options(
         method=Method(given.method),

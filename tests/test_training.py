@@ -28,6 +28,7 @@ from pup.policy.network import ProjectedPolicy
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
 from services import training
+from services.arguments import parser
 from workers.cluster import connected
 from workers.learner import FragmentsToBatch, Learning, merged, prepared, shuffled
 from workers.module import PolicyModule, load
@@ -352,3 +353,12 @@ def test_the_learner_takes_a_gpu_where_it_is_faster(
     minibatch: int, here: bool, anywhere: bool, place: tuple[int, int]
 ) -> None:
     assert learner_place(minibatch, here, anywhere) == place
+
+
+@pytest.mark.parametrize(
+    ("words", "sharpen"),
+    [("", 4.0), ("--start .", 1.0), ("--sharpen 2", 2.0), ("--start . --sharpen 2", 2.0)],
+)
+def test_exploration_falls_from_scratch_unless_told(words: str, sharpen: float) -> None:
+    given = parser().parse_args(["train", "--out", ".", *words.split()])
+    assert training.training_options(given).learning.sharpen == sharpen

@@ -131,12 +131,10 @@ def policy(task: Task) -> dict[str, Any]:
         shutil.copytree(given, folder, dirs_exist_ok=True)
         return {"weights": sha256(folder / WEIGHTS), "ready": True, "steps": None}
     start = task.needed["start"] / "policy" if "start" in task.needed else None
+    given = training(told["training"])
+    given.start = start
     options = replace(
-        training_options(training(told["training"])),
-        method=method,
-        direction=direction,
-        seed=told["seed"],
-        start=start,
+        training_options(given), method=method, direction=direction, seed=told["seed"]
     )
     bounds = task.needed["bounds"] / "bounds.json"
     done = train(task.simulated, bounds, options, task.out, _one_core, lambda row, steps: None)
