@@ -253,7 +253,8 @@ class _Job:
         spread = spread_at(bounded, at, self._uncertainty)
         known, together = spread.confidence(0.9), spread.together(0.95)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
-        lower, upper = widened(lower, upper, (together.lower, together.upper), space)
+        if not self.options.as_described:  # the interval is of a minimum, which kept values are not
+            lower, upper = widened(lower, upper, (together.lower, together.upper), space)
         lower = np.where(spread.unseen, space.lower, lower)
         upper = np.where(spread.unseen, space.upper, upper)
         actuator = self.options.actuator
