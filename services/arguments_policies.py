@@ -18,7 +18,7 @@ from services.options import (
 TRAINING = (
     ("--steps", (1000, 10**11), int, 10_000_000, "control steps of all simulations together"),
     ("--simulations", (1, 65536), int, 128, "at once, of each process that simulates"),
-    ("--length", (2, 4096), int, 40, "control steps of each simulation between two updates"),
+    ("--length", (2, 4096), int, 80, "control steps of each simulation between two updates"),
     ("--epochs", (1, 100), int, 5, "passes over the samples of an update"),
     ("--minibatch", (16, 2**20), int, 256, "samples of a gradient step"),
     ("--learning-rate", (1e-7, 1.0), float, 3e-4, "at the beginning"),

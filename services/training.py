@@ -42,7 +42,7 @@ CHECKPOINT_SECONDS = 30.0
 ROBOTS_A_THREAD = 64
 """Fewer wait longer for each other than they save: 256 robots on 16 cores take 5,000 steps a second
 on 16 threads and 8,100 on 4 (docs/results/training.md)."""
-SMOOTHED = 40
+SMOOTHED = 20
 """Iterations whose mean return says which weights were best so far."""
 SHARPEN = 4.0
 """By which exploration falls in a training from scratch; one that goes on explores as it did."""
@@ -77,7 +77,7 @@ class Options:
     steps: int = 10_000_000
     seed: int = 0
     simulations: int = 128
-    length: int = 40
+    length: int = 80
     learning: Learning = field(default_factory=Learning)
     runners: int = 0
     start: Path | None = None

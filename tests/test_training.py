@@ -185,11 +185,22 @@ def test_weights_are_those_of_the_seed(ray_here: None) -> None:
     assert not same(first, weights_after(other, 3))
 
 
+SHARED = replace(TOY, sampling=replace(SAMPLING, threads=2))
+"""Samples on two threads, which the learner leaves alone: it has a process of its own."""
+
+
 @pytest.mark.ray
-@pytest.mark.parametrize("runners", [0, 2])
-def test_a_restored_training_ends_alike(ray_here: None, runners: int) -> None:
+def test_a_learner_in_a_process_of_its_own_learns_the_same(ray_here: None) -> None:
+    with closing(Trainer(SHARED)) as trainer:
+        learner_pid = trainer.algorithm.learner_group.foreach_learner(lambda _: os.getpid())
+        assert [one.get() for one in learner_pid] != [os.getpid()]
+    assert same(weights_after(TOY, 3), weights_after(SHARED, 3))
+
+
+@pytest.mark.ray
+@pytest.mark.parametrize("setup", [TOY, replace(TOY, runners=2), SHARED])
+def test_a_restored_training_ends_alike(ray_here: None, setup: Setup) -> None:
     """With the same weights as one that went on."""
-    setup = replace(TOY, runners=runners)
     with closing(Trainer(setup)) as trainer:
         for _ in range(2):
             trainer.iterate()
@@ -341,18 +352,20 @@ def test_policies_that_see_no_parameters(ray_here: None, tmp_path: Path, method:
 
 
 @pytest.mark.parametrize(
-    ("minibatch", "here", "anywhere", "place"),
+    ("minibatch", "here", "anywhere", "shared", "place"),
     [
-        (256, True, True, (0, 0)),  # a core is faster
-        (4096, True, True, (0, 1)),
-        (4096, False, True, (1, 1)),
-        (4096, False, False, (0, 0)),
+        (256, True, True, False, (0, 0)),  # a core is faster
+        (256, True, True, True, (1, 0)),
+        (4096, True, True, True, (0, 1)),
+        (4096, False, True, False, (1, 1)),
+        (4096, False, False, False, (0, 0)),
+        (4096, False, False, True, (1, 0)),
     ],
 )
 def test_the_learner_takes_a_gpu_where_it_is_faster(
-    minibatch: int, here: bool, anywhere: bool, place: tuple[int, int]
+    minibatch: int, here: bool, anywhere: bool, shared: bool, place: tuple[int, int]
 ) -> None:
-    assert learner_place(minibatch, here, anywhere) == place
+    assert learner_place(minibatch, here, anywhere, shared) == place
 
 
 @pytest.mark.parametrize(

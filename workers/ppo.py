@@ -182,16 +182,19 @@ def _numbers(told: dict[str, Any]) -> dict[str, float]:
     return {name: float(told[name].peek()) for name in (*Losses._fields, "rate")}
 
 
-def learner_place(minibatch: int, here: bool, anywhere: bool) -> tuple[int, int]:
+def learner_place(minibatch: int, here: bool, anywhere: bool, shared: bool) -> tuple[int, int]:
     """Remote learners, and GPUs of a learner.
 
     Args:
       minibatch: samples of a step.
       here: whether this process sees a GPU.
       anywhere: whether the cluster has one.
+      shared: whether this process samples on several cores: a learner beside it would wait for
+        Python's lock, and the samples for the learner.
     """
-    wanted = minibatch >= GPU_MINIBATCH and (here or anywhere)
-    return int(wanted and not here), int(wanted)
+    if minibatch >= GPU_MINIBATCH and (here or anywhere):
+        return int(not here), 1
+    return int(shared), 0
 
 
 def _start(setup: Setup) -> BatchPPO:
@@ -202,7 +205,8 @@ def _start(setup: Setup) -> BatchPPO:
     seen, done = spaces(setup.shape.proprioception, setup.shape.joints, setup.shape.bins)
     here = torch.cuda.is_available()
     anywhere = ray.cluster_resources().get("GPU", 0) > 0
-    remote, gpus = learner_place(setup.learning.minibatch, here, anywhere)
+    shared = setup.runners == 0 and setup.sampling.threads > 1
+    remote, gpus = learner_place(setup.learning.minibatch, here, anywhere, shared)
     config = (
         PPOConfig(algo_class=BatchPPO)
         .environment(
@@ -223,6 +227,7 @@ def _start(setup: Setup) -> BatchPPO:
         )
         .learners(
             num_learners=remote,
+            num_cpus_per_learner=0,  # runners may have all there are; it would wait for ever
             num_gpus_per_learner=gpus,
             learner_connector=lambda *_: FragmentsToBatch(setup.learning),
             add_default_connectors_to_learner_pipeline=False,
