@@ -198,6 +198,17 @@ def test_a_learner_in_a_process_of_its_own_learns_the_same(ray_here: None) -> No
 
 
 @pytest.mark.ray
+def test_a_learner_that_is_lost_is_told(ray_here: None) -> None:
+    with closing(Trainer(SHARED)) as trainer:
+        trainer.iterate()
+        (told,) = trainer.algorithm.learner_group.foreach_learner(lambda _: os.getpid())
+        os.kill(told.get(), signal.SIGKILL)
+        with pytest.raises(ConnectionError, match="the same command resumes"):
+            for _ in range(3):
+                trainer.iterate()
+
+
+@pytest.mark.ray
 @pytest.mark.parametrize("setup", [TOY, replace(TOY, runners=2), SHARED])
 def test_a_restored_training_ends_alike(ray_here: None, setup: Setup) -> None:
     """With the same weights as one that went on."""

@@ -14,6 +14,7 @@ import numpy as np
 import ray
 import torch
 from numpy.typing import NDArray
+from ray.exceptions import RayActorError
 from ray.rllib.algorithms.ppo import PPO, PPOConfig
 from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_RL_MODULE, DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
@@ -275,8 +276,18 @@ class Trainer:
         self.runners = setup.runners
 
     def iterate(self) -> Iteration:
-        """Sample and learn."""
-        self.algorithm.train()
+        """Sample and learn.
+
+        Raises:
+          ConnectionError: the learner's process was lost.
+        """
+        try:
+            self.algorithm.train()
+        except RayActorError as error:  # RLlib replaces runners, but no learner
+            raise ConnectionError(
+                "the process that learns was lost, perhaps for want of memory; the same command "
+                "resumes"
+            ) from error
         return self.algorithm.told
 
     def weights(self) -> State:
