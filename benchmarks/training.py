@@ -70,6 +70,7 @@ def main() -> None:
     options.add_argument("--simulations", type=int, default=128)
     options.add_argument("--length", type=int, default=80)
     given = options.parse_args()
+    torch.set_num_threads(1)  # for all of them: networks are so small that two are slower
     logging.getLogger("ray").setLevel(logging.ERROR)
     report = Report("training", given.json)
     work = _work(given)

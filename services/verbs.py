@@ -31,7 +31,8 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
     given = options.recordings
     recordings = load_recordings([given], robot) if given else default_recordings(robot)
     known = options.start
-    if known is None and _identified(robot) == (options.actuator or robot.actuator):
+    law = options.actuator or robot.actuator
+    if known is None and not options.as_described and _identified(robot) == law:
         known = robot.identified_path
     if options.generations is None:
         options.generations = GENERATIONS if known is None else FURTHER

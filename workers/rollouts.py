@@ -250,8 +250,8 @@ class BatchRunner(EnvRunner, Checkpointable):
         self.newest = 0
         # Beside remote runners the one in the algorithm's process only holds weights.
         here = self.worker_index > 0 or self.config.num_env_runners == 0
-        if self.worker_index > 0:
-            torch.set_num_threads(1)
+        if here:
+            torch.set_num_threads(1)  # its simulations have the cores
         self.sampler = Sampler(self.sampling, self.worker_index) if here else None
 
     def sample(self, **_: Any) -> list[Fragment]:
