@@ -67,7 +67,7 @@ class Work:
 
 def main() -> None:
     options = parser(__doc__, rounds=3)
-    options.add_argument("--simulations", type=int, default=128)
+    options.add_argument("--simulations", type=int, default=256)
     options.add_argument("--length", type=int, default=80)
     given = options.parse_args()
     torch.set_num_threads(1)  # for all of them: networks are so small that two are slower

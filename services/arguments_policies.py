@@ -17,7 +17,7 @@ from services.options import (
 
 TRAINING = (
     ("--steps", (1000, 10**11), int, 10_000_000, "control steps of all simulations together"),
-    ("--simulations", (1, 65536), int, 128, "at once, of each process that simulates"),
+    ("--simulations", (1, 65536), int, 256, "at once, of each process that simulates"),
     ("--length", (2, 4096), int, 80, "control steps of each simulation between two updates"),
     ("--epochs", (1, 100), int, 5, "passes over the samples of an update"),
     ("--minibatch", (16, 2**20), int, 256, "samples of a gradient step"),
@@ -71,7 +71,7 @@ def train(verb: argparse.ArgumentParser) -> None:
         "--sharpen",
         type=number(0.1, 10.0, float),
         metavar="X",
-        help="by which exploration falls besides what is learnt; default: 4 from scratch, else 1",
+        help="by which exploration falls besides what is learnt; default: 2.5 from scratch, else 1",
     )
     policy.add_argument(
         "--schedule",

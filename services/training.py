@@ -42,9 +42,9 @@ CHECKPOINT_SECONDS = 30.0
 ROBOTS_A_THREAD = 64
 """Fewer wait longer for each other than they save: 256 robots on 16 cores take 5,000 steps a second
 on 16 threads and 8,100 on 4 (docs/results/training.md)."""
-SMOOTHED = 20
+SMOOTHED = 10
 """Iterations whose mean return says which weights were best so far."""
-SHARPEN = 4.0
+SHARPEN = 2.5
 """By which exploration falls in a training from scratch; one that goes on explores as it did."""
 ETAS = 20_000
 """Draws of mu whose projections span eta's box."""
@@ -76,7 +76,7 @@ class Options:
     direction: Direction = Direction.FORWARD
     steps: int = 10_000_000
     seed: int = 0
-    simulations: int = 128
+    simulations: int = 256
     length: int = 80
     learning: Learning = field(default_factory=Learning)
     runners: int = 0

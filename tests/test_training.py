@@ -381,7 +381,7 @@ def test_the_learner_takes_a_gpu_where_it_is_faster(
 
 @pytest.mark.parametrize(
     ("words", "sharpen"),
-    [("", 4.0), ("--start .", 1.0), ("--sharpen 2", 2.0), ("--start . --sharpen 2", 2.0)],
+    [("", 2.5), ("--start .", 1.0), ("--sharpen 2", 2.0), ("--start . --sharpen 2", 2.0)],
 )
 def test_exploration_falls_from_scratch_unless_told(words: str, sharpen: float) -> None:
     given = parser().parse_args(["train", "--out", ".", *words.split()])
