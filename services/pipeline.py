@@ -145,16 +145,8 @@ class _Job:
             self.left_out[CORRECTED] = "nothing to correct was found" if nothing else undetermined
             return None
         robot = RobotDescription.load(str(self.out / DIAGNOSIS / CORRECTED))
-        first = self.mission.presysid
-        options = replace(
-            first,
-            subset_generations=_half(first.subset_generations),
-            folds=0,
-            actuator="pd",  # as it was diagnosed: what was found is missing beside PD servos
-            compare=False,
-            start=None,
-            as_described=True,  # the diagnosis has fitted it, to more than these recordings
-        )
+        options = self.mission.presysid.corrected()
+        options = replace(options, subset_generations=_half(options.subset_generations))
         return Half(robot, options, CORRECTED)
 
     def _presysid(self, half: Half) -> Stage:

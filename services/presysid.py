@@ -71,6 +71,14 @@ class Options:
     start: Path | None = None
     as_described: bool = False
 
+    def corrected(self) -> "Options":
+        """The same for a robot that a diagnosis has corrected.
+
+        Its servos are PD, as they were diagnosed: what was found is missing beside these. The
+        diagnosis has fitted its values, to more than the recordings.
+        """
+        return replace(self, actuator="pd", compare=False, folds=0, start=None, as_described=True)
+
     def told(self) -> dict[str, Any]:
         """As files have it: a file is known by its content, wherever it lies."""
         told = asdict(self)

@@ -1,7 +1,7 @@
 """The cells of an experiment: runs that stand alone, each told by what it depends on."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -185,11 +185,7 @@ class _Graph:
         for seed in self._seeds(walk):
             refit = f"presysid-r{seed}-corrected"
             if refit not in self._cells:
-                # PD servos: what a diagnosis finds is missing beside these.
-                fits = replace(
-                    self.plan.presysid, actuator="pd", compare=False, folds=0, as_described=True
-                )
-                told = self._fitted(fits)
+                told = self._fitted(self.plan.presysid.corrected())
                 needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
                 weight = self._cells[f"presysid-r{seed}"].weight
                 self._add(Cell(refit, "presysid", needs, told, self._given(), weight))
