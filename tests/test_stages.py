@@ -150,7 +150,8 @@ def test_the_report_tells_what_each_stage_found_and_hashes(tmp_path: Path) -> No
     loss = {"loss": 1.0, "loss_before": 2.0, "rmse": 0.1, "rmse_before": 0.2}
     parameter = {"name": "rho", "unit": "1", "nominal": 1, "lower": 0, "upper": 2}
     documents = {
-        "presysid": {"parameters": [parameter | {"identified": True}], "loss": {"train": loss}},
+        "presysid": {"parameters": [parameter | {"identified": True}]}
+        | {"loss": {"train": loss}, "provenance": {"options": {"as_described": False}}},
         "replay": {"per_recording": {"<i>a": 0.1}, "rmse": 0.1, "unit": "rad"},
         "transfer": {
             "horizon": 15.0,
