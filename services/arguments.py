@@ -81,7 +81,7 @@ def _run(verb: argparse.ArgumentParser) -> None:
     for name, most, default, told in (
         ("--train-steps", 10**11, None, "of training, on Ray in any case; default: 150000, 0 none"),
         ("--trials", 1000, None, "walks of a virtual robot at most, to choose eta by; default: 25, "
-         "0 leaves them out"),
+         "none where recordings are of hardware; 0 leaves them out"),
         ("--repeats", 100, 5, "walks of the chosen eta and of the fitted one; default: 5"),
     ):  # fmt: skip
         later.add_argument(name, type=number(0, most), default=default, metavar="N", help=told)

@@ -316,9 +316,14 @@ class _Job:
         return ""
 
     def _no_trials(self) -> str:
-        """Why there can be no trials; empty where there can."""
+        """Why there can be no trials; empty where there can.
+
+        They walk a virtual robot: what it does says nothing of one of hardware.
+        """
         if self.robot.gait is None or not (self.steps or (self.shipped / CARD).is_file()):
             return "there is no policy to walk with"
+        if any(recording.source != "simulation" for recording in self.recordings):
+            return "the robot that was recorded is not here to walk; it does by pup transfer"
         if any(joint.servo_id is None for joint in self.robot.joints):
             return f"robot {self.robot.name!r} has joints without servos"
         if any(find_spec(name) is None for name in ("fastapi", "botorch", "httpx")):

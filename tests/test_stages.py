@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import agents
@@ -14,6 +15,7 @@ from pup.files import write_json
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
 from services.job_report import Job, found, write_report
+from services.mission import TRIALS
 from services.pipeline import POLICIES
 from services.stages import Done, Journal, Stage
 from tests.reports import Page
@@ -108,6 +110,26 @@ def test_what_a_robot_cannot_do_is_refused_before_anything_is_done(
     done = pup("run", "--robot", folder, *given, "--out", place.out, *TINY, *options)
     assert_refused(done, words)
     assert not files(place.out)
+
+
+def test_a_virtual_robot_walks_for_no_other(tmp_path: Path) -> None:
+    """Its walks would be diagnosed together with recordings of a robot that it knows nothing of."""
+    from services.mission import Means, Mission, default_recordings
+    from services.pipeline import _Job
+    from services.presysid import Options
+
+    means = Means(*[None] * 6, print, 1)  # type: ignore[arg-type]  # no stage is run
+
+    def job(source: str, trials: int | None) -> _Job:
+        *others, last = default_recordings(DARWIN)
+        recordings = [*others, replace(last, source=source)]
+        return _Job(DARWIN, recordings, Mission(Options(), 1000, trials), tmp_path, means)
+
+    assert job("simulation", None).trials == TRIALS
+    real = job("hardware", None)
+    assert real.trials == 0 and "pup transfer" in real.left_out["transfer"]
+    with pytest.raises(InputError, match="--trials: the robot that was recorded is not here"):
+        job("hardware", 3)
 
 
 def test_a_shipped_policy_is_started_from_where_there_is_one(
