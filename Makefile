@@ -34,7 +34,7 @@ lint: $(VENV)/.tested
 
 # Two processes: fixtures of a file are made once, and no test runs in the one whose exit counts.
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile --durations 20
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 slow: $(VENV)/.tested
 	$(BIN)/python -m pytest -m slow

@@ -21,9 +21,6 @@ Selection = slice | NDArray[np.int64]
 
 FLOOR = "floor"
 """Name of the floor's geom in a robot's MJCF; its friction is the ground's (priority 1)."""
-ASKEW = 0.15
-"""By how much an IMU may be askew, rad: one is that tells a robot at rest to lean off its soles by
-less. The authors took 0.075 off their IMU's pitch by hand."""
 
 # A simulation that breaks down is told by its trajectories, a model that is wrong by an exception.
 # MuJoCo would also print each, and write MUJOCO_LOG.TXT to wherever the user stands.
@@ -167,28 +164,16 @@ def starting_qpos(
       position: the joints' first positions, shape (n_joints,), rad.
       recording: gives the IMU's first reading.
     """
-    torso = first_tilt(robot, model, position, recording)
-    return standing_qpos(robot, model, position, torso)
+    return standing_qpos(robot, model, position, first_tilt(robot, model, recording))
 
 
-def first_tilt(
-    robot: RobotDescription, model: Model, position: Array, recording: Recording
-) -> Array:
-    """The torso's orientation by the IMU's roll and pitch at the start, (4,); NaN without them.
-
-    NaN also where a robot rests on its soles by all but a little: they tell how it stands, and to
-    begin on their edges, where an IMU that is askew would put it, is to begin with a fall.
-    """
+def first_tilt(robot: RobotDescription, model: Model, recording: Recording) -> Array:
+    """The torso's orientation by the IMU's roll and pitch at the start, (4,); NaN without them."""
     ticks = ticks_at_rest(recording)
     roll, pitch = (
         _first_known(recording.extras.get(f"imu/{angle}"), ticks) for angle in ("roll", "pitch")
     )
-    torso = tilted(robot, model, roll, pitch)
-    if ticks > 1 and model.floating and robot.feet:
-        flat = _feet_flat(robot, model.compiled, _upright(model, position))
-        if 2 * np.arccos(min(abs(float(torso @ flat)), 1.0)) < ASKEW:  # never by NaN
-            return np.full(4, np.nan)
-    return torso
+    return tilted(robot, model, roll, pitch)
 
 
 def tilted(robot: RobotDescription, model: Model, roll: float, pitch: float) -> Array:
@@ -211,23 +196,16 @@ def standing_qpos(robot: RobotDescription, model: Model, position: Array, torso:
       position: of the joints, shape (n_joints,), rad.
       torso: quaternion, shape (4,); NaN for none.
     """
-    data = _upright(model, position)
+    data = mujoco.MjData(model.compiled)
+    data.qpos[model.qpos] = position
     if not model.floating:
         return np.array(data.qpos)
+    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model.compiled, data)
     data.qpos[3:7] = _feet_flat(robot, model.compiled, data) if np.isnan(torso).any() else torso
     mujoco.mj_kinematics(model.compiled, data)
     data.qpos[2] -= lowest_point(model.compiled, data.geom_xpos, data.geom_xmat)
     return np.array(data.qpos)
-
-
-def _upright(model: Model, position: Array) -> mujoco.MjData:
-    """A configuration, its torso upright where it is not fixed."""
-    data = mujoco.MjData(model.compiled)
-    data.qpos[model.qpos] = position
-    if model.floating:
-        data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
-        mujoco.mj_kinematics(model.compiled, data)
-    return data
 
 
 def _first_known(values: Array | None, ticks: int) -> float:

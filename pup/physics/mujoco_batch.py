@@ -151,7 +151,7 @@ class MujocoSimulator:
         ordered = [plans[i] for i in members]
         steps = ordered[0].steps
         power = np.stack([_extended(p.power, steps) for p in ordered], axis=1)
-        torso = [first_tilt(self.robot, model, plans[i].start, self.recordings[i]) for i in members]
+        torso = [first_tilt(self.robot, model, self.recordings[i]) for i in members]
         start = [
             standing_qpos(self.robot, model, plans[i].start, tilt)
             for i, tilt in zip(members, torso, strict=True)
