@@ -8,11 +8,13 @@ import logging
 import os
 import queue
 import subprocess
+import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
+from dataclasses import dataclass, field
 from importlib.metadata import version
+from shutil import which
 from typing import Any
 
 import zmq
@@ -55,6 +57,22 @@ TURN = 0.05  # s, the longest sleep of the loop
 RESEND = 2.0  # s between two sendings of an end that is not acknowledged
 TAKEOVER = 5.0  # s that another process may still have the bus
 PATIENCE = 5.0  # s that a command waits for the loop
+MOVING = ("enable", "arm")  # commands that are not done once the robot was stopped
+
+
+@dataclass
+class Call:
+    """A command that waits for the loop.
+
+    Attributes:
+      command: what was asked.
+      stops: emergency stops by then.
+      done: the answer.
+    """
+
+    command: dict[str, Any]
+    stops: int
+    done: Future[Any] = field(default_factory=Future)
 
 
 class Agent:
@@ -77,12 +95,12 @@ class Agent:
         self._body.guard.warm(self._warmth.left())
         self._shelf = Shelf(settings.policies, self._robot)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[Call] = queue.SimpleQueue()
+        self._stops = 0
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._link = Link(settings.link, self._hello) if settings.link.gateway else None
         self._control = ControlServer(settings.socket, self.answer)
         self._stopper: subprocess.Popen[bytes] | None = None
-        self._stopper_end = -1
         self._ending = False
         self._beaten = self._resent = 0.0
         self._seen: AgentState | None = None
@@ -129,14 +147,19 @@ class Agent:
           InputError: it cannot be done; the message says why.
         """
         if command.get("do") == "stop":  # before anything that may be busy
-            self._motion.stop(str(command.get("reason", "at the robot's computer")))
+            self._stop(str(command.get("reason", "at the robot's computer")))
             return {}
         if command.get("do") == "health":
             return self.health()
-        done: Future[Any] = Future()
-        self._calls.put((lambda: self._command(command), done))
+        call = Call(command, self._stops)
+        self._calls.put(call)
         self._ring()
-        return done.result(timeout=PATIENCE) or {}
+        try:
+            return call.done.result(timeout=PATIENCE) or {}
+        except TimeoutError as error:
+            if call.done.cancel():
+                raise InputError("the agent is busy; nothing was done") from error
+            raise InputError("the agent is still at it; `pup-agent health` tells more") from error
 
     def health(self) -> dict[str, Any]:
         """See `hardware_agent.health`."""
@@ -170,14 +193,7 @@ class Agent:
         """Sleep until something happens, and see to everything."""
         self._sleep()
         while not self._calls.empty():
-            call, done = self._calls.get()
-            try:
-                done.set_result(call())
-            except InputError as error:
-                done.set_exception(error)
-            except Exception as error:  # a command must not end who holds the robot
-                log.exception("a command failed")
-                done.set_exception(InputError(f"the agent failed at it: {brief(str(error))}"))
+            self._answer(self._calls.get())
         if self._link is not None:
             for message in self._link.receive():
                 self._receive(message)
@@ -186,25 +202,37 @@ class Agent:
         self._conductor.tend()
         self._beat()
 
+    def _answer(self, call: Call) -> None:
+        if not call.done.set_running_or_notify_cancel():  # who asked has been told that it is not
+            return
+        try:
+            if call.stops != self._stops and call.command.get("do") in MOVING:
+                raise InputError("the robot was stopped meanwhile; ask again")
+            call.done.set_result(self._command(call.command))
+        except InputError as error:
+            call.done.set_exception(error)
+        except Exception as error:  # a command must not end who holds the robot
+            log.exception("a command failed")
+            call.done.set_exception(InputError(f"the agent failed at it: {brief(str(error))}"))
+
+    def _stop(self, reason: str) -> None:
+        """The emergency stop; what was asked before it is not done after it. From any thread."""
+        self._stops += 1
+        self._motion.stop(reason)
+
     def _sleep(self) -> None:
         poller = zmq.Poller()
         poller.register(self._bell, zmq.POLLIN)
         for socket in self._link.sockets if self._link else ():
             poller.register(socket, zmq.POLLIN)
-        if self._stopper is not None:
-            poller.register(self._stopper_end, zmq.POLLIN)
         poller.poll(round(TURN * 1000))
         with suppress(BlockingIOError):
             os.eventfd_read(self._bell)
-        if self._stopper is not None and self._stopper.poll() is not None:
-            os.close(self._stopper_end)
-            self._stopper = None
-            self._motion.stop("the emergency stop's command has ended")
 
     def _receive(self, message: Message) -> None:
         body = message.body
         if isinstance(body, Stop):
-            self._motion.stop(f"gateway: {body.reason}")
+            self._stop(f"gateway: {body.reason}")
         elif isinstance(body, Assign):
             answers = self._book.assigned(body)
             if not answers:
@@ -244,14 +272,27 @@ class Agent:
             raise InputError(f"{do!r} is no command of this agent")
 
     def _watch_stop(self) -> None:
-        """Start the command that waits for the emergency stop, if there is one."""
+        """Start the command that waits for the emergency stop, if there is one.
+
+        A thread of its own waits for its end, for this loop writes files. The command ends with an
+        agent that is killed, where setpriv is there: it may own a line that the next one needs.
+        """
         command = self._settings.stop.command
-        if command and self._stopper is None:
-            try:
-                self._stopper = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-                self._stopper_end = os.pidfd_open(self._stopper.pid)  # wakes who waits for it
-            except OSError as error:
-                raise InputError(f"stop.command: {command[0]}: {error.strerror}") from error
+        if not command or (self._stopper is not None and self._stopper.poll() is None):
+            return
+        if which(command[0]) is None:
+            raise InputError(f"stop.command: {command[0]}: no such program")
+        bound = ("setpriv", "--pdeathsig", "KILL") if which("setpriv") else ()
+        try:
+            self._stopper = subprocess.Popen([*bound, *command], stdin=subprocess.DEVNULL)
+        except OSError as error:
+            raise InputError(f"stop.command: {command[0]}: {error.strerror}") from error
+        threading.Thread(target=self._stop_after, args=(self._stopper,), daemon=True).start()
+
+    def _stop_after(self, stopper: "subprocess.Popen[bytes]") -> None:
+        stopper.wait()
+        if not self._ending:
+            self._stop("the emergency stop's command has ended")
 
     def _beat(self) -> None:
         now = time.monotonic()

@@ -46,8 +46,10 @@ class Journal:
         """
         text = json.dumps(entry | {"at": time.time()}, allow_nan=False, separators=(",", ":"))
         line = f"{zlib.crc32(text.encode()):08x} {text}\n".encode()
+        before = os.fstat(self._handle).st_size
         written = os.write(self._handle, line)
         if written != len(line):
+            os.ftruncate(self._handle, before)  # what comes next is not to stand behind a torn line
             raise OSError(f"{self.file}: the disk is full")
         os.fsync(self._handle)
 

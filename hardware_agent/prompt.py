@@ -70,7 +70,11 @@ def _press(socket: Path, key: str, asked: str) -> bool:
 
 
 def _measure(socket: Path) -> None:
-    typed = input("distance in m (nothing: the trial does not count): ").strip()
+    try:
+        typed = input("distance in m (nothing: the trial does not count): ").strip()
+    except EOFError:  # Ctrl-D; it is asked for again
+        print()
+        return
     try:
         if typed:
             say(socket, {"do": "distance", "distance": float(typed.replace(",", "."))})

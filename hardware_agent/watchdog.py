@@ -124,7 +124,7 @@ def make_limp(bus: "object") -> bool:
       Whether a servo answered at all.
     """
     from hardware_agent.bus import Bus
-    from hardware_agent.port import BusError
+    from hardware_agent.port import BusError, BusyError
 
     assert isinstance(bus, Bus)
     deadline = time.monotonic() + PERSISTENCE
@@ -137,6 +137,13 @@ def make_limp(bus: "object") -> bool:
         except BusError as error:
             print(f"watchdog: {error}", file=sys.stderr)
             time.sleep(0.05)
+            bus.close()  # an adapter that was out and in again does not answer an old handle
+            try:
+                bus.take()
+            except BusyError:  # another agent has it by now, which makes the robot limp
+                return False
+            except BusError:
+                pass  # it is told in the next round
             continue
         if True not in told and False in told:
             return True

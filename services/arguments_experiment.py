@@ -56,6 +56,9 @@ def experiment(verb: argparse.ArgumentParser) -> None:
     place(verb)
 
 
+MOST_ROBOTS = 10_000
+
+
 def _name(text: str) -> str:
     """A cell, such as trials-r1000-forward-pup."""
     if not re.fullmatch(r"[a-z0-9-]{1,80}", text):
@@ -73,10 +76,13 @@ def _seeds(text: str) -> tuple[int, ...]:
     """Seeds such as 3,5,10-14."""
     told: list[int] = []
     for part in text.split(","):
-        first, _, last = part.partition("-")
-        if not first.isdecimal() or (last and not last.isdecimal()):
+        first, dash, last = part.partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
             raise argparse.ArgumentTypeError(f"{text!r} is not A-B,..., whole numbers from 0")
-        told += range(int(first), int(last or first) + 1)
-    if not told or len(set(told)) < len(told) or len(told) > 10_000:
+        begin, end = int(first), int(last or first)
+        if end - begin >= MOST_ROBOTS:
+            raise argparse.ArgumentTypeError(f"{text[:40]!r} names more than {MOST_ROBOTS} robots")
+        told += range(begin, end + 1)
+    if not told or len(set(told)) < len(told) or len(told) > MOST_ROBOTS:
         raise argparse.ArgumentTypeError(f"{text!r} does not name robots, each once")
     return tuple(told)

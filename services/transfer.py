@@ -97,6 +97,8 @@ class Gateway:
                 why = _detail(answer) if later else f"it answers {answer.status_code}"
             except httpx.HTTPError as error:
                 why = str(error) or type(error).__name__
+            except ValueError as error:  # a key beyond ASCII, a number that JSON does not know
+                raise InputError(f"what was given cannot be sent ({error})") from error
             if not self.met or time.monotonic() - began > PATIENCE:
                 raise InputError(
                     f"{self.url}: no gateway answers ({why}); start one with `pup serve`, or say "

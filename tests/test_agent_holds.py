@@ -3,6 +3,7 @@
 import json
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,6 +51,37 @@ def test_an_enable_that_was_refused_is_not_done_later(tmp_path: Path) -> None:
         time.sleep(0.5)
         assert made.health()["state"] != "enabled"
         assert holding(made) == 0
+
+
+def test_what_was_asked_before_a_stop_is_not_done_after_it(tmp_path: Path) -> None:
+    """Two `enable` wait, one in the loop and one for it; somebody presses stop."""
+    with lab(tmp_path) as made:
+        made.start()
+        made.side(cmd="fault", kind="port_pulled")
+        wait(lambda: not made.health()["bus"]["works"], 20, made.log)
+        with ThreadPoolExecutor(2) as pool:
+            asked = [pool.submit(made.say, "enable") for _ in range(2)]
+            time.sleep(0.5)
+            made.say("stop")
+            told = [str(one.exception(timeout=20)) for one in asked]
+        assert sorted("ask again" in words for words in told) == [False, True], told
+        made.side(cmd="fault", kind="port_pulled", off=True)
+        wait(lambda: made.health()["bus"]["works"], 20, made.log)
+        time.sleep(0.5)
+        assert holding(made) == 0
+
+
+def test_the_watchdog_finds_an_adapter_that_was_out_and_in_again(tmp_path: Path) -> None:
+    with lab(tmp_path) as made:
+        made.start()
+        made.side(cmd="fault", kind="port_pulled")
+        wait(lambda: not made.health()["bus"]["works"], 20, made.log)
+        made.side(cmd="fault", kind="port_pulled", off=True)
+        wait(lambda: made.health()["bus"]["works"], 20, made.log)
+        enabled(made)
+        assert holding(made) == 20
+        made.kill()
+        wait(lambda: holding(made) == 0, 10, made.log)
 
 
 def test_servos_whose_cable_was_out_are_made_limp_when_it_is_back(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """At most one motion per trial, and no end that gets lost, whatever the link and the power do."""
 
 import json
+import os
 import random
 from collections import Counter
 from dataclasses import dataclass, field
@@ -36,6 +37,21 @@ def assign(trial: str = "t", attempt: int = 1, fence: int = 1) -> Assign:
 
 def book(folder: Path) -> TrialBook:
     return TrialBook(Journal(folder / "journal"))
+
+
+def test_no_entry_stands_behind_one_that_a_full_disk_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal, write = Journal(tmp_path / "journal"), os.write
+    journal.append({"event": "one"})
+    with monkeypatch.context() as full:
+        full.setattr(os, "write", lambda file, line: write(file, line[:9]))
+        with pytest.raises(OSError, match="the disk is full"):
+            journal.append({"event": "lost"})
+    journal.append({"event": "two"})
+    journal.close()
+    kept = Journal(tmp_path / "journal").entries
+    assert [entry["event"] for entry in kept] == ["one", "two"]
 
 
 class PowerCutError(Exception):

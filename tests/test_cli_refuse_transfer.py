@@ -109,6 +109,12 @@ def _(place: Place) -> Made:
     return serve(place, 'link = "5555"'), ("link", "'5555'", "tcp://")
 
 
+@case("a certificate that is not there")
+def _(place: Place) -> Made:
+    told = serve(place, 'certificate = "none.pem"\nkey = "none.key"')
+    return told, ("certificate none.pem", "No such file")
+
+
 @case("a certificate without its key")
 def _(place: Place) -> Made:
     return serve(place, 'certificate = "c.pem"'), ("certificate", "key")

@@ -1,5 +1,6 @@
 """Plans of experiments, the cells that they mean, and what these depend on."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from pup.errors import InputError
 from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
+from services.arguments import parser
 from services.experiment.cells import chosen, graph
 from services.experiment.plan import STAGES, Plan, Train, Walk, read_plan, small, training
 
@@ -37,6 +39,7 @@ REFUSED = {
     "schema = 1\n[trials]\nwalks = 3": "trials.walks: unknown key",
     "schema = 1\n[fleet]\ngenerations = 'x'": "expected a whole number",
     "schema = 1\n[train]\nfleet = '--steps x'": "train: argument --steps",
+    'schema = 1\n[train]\nfleet = "--steps \'5"': "cannot be read (No closing quotation)",
     "schema = 1\n[train]\nfleet = '--seed 3'": "--seed is the experiment's to say",
     "schema = 1\n[[walk]]\ndirection = 'up'": "'up' is not a valid Direction",
     "schema = 1\n[[walk]]\ndirection = 'forward'\nmethods = ['x']": "'x' is not a valid Method",
@@ -149,6 +152,17 @@ def test_some_robots_and_some_methods() -> None:
 def test_a_robot_without_a_gait_is_refused() -> None:
     with pytest.raises(InputError, match="needs a gait"):
         graph(replace(small(), robot="servo_bench"))
+
+
+@pytest.mark.parametrize("told", ["0-1000000000", "1-" + 30 * "9", "0-9999,10000-19999", "3-"])
+def test_seeds_are_counted_before_they_are_made(
+    told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A request of a job names them too, and is read by the service itself."""
+    begun = time.monotonic()
+    with pytest.raises(SystemExit):
+        parser().parse_args(["experiment", "--small", "--seeds", told, "--out", "x"])
+    assert time.monotonic() - begun < 5 and "--seeds" in capsys.readouterr().err
 
 
 def test_words_of_a_training() -> None:

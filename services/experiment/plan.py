@@ -83,7 +83,10 @@ def training(words: str) -> argparse.Namespace:
     """
     from services.arguments import parser
 
-    told = shlex.split(words)
+    try:
+        told = shlex.split(words)
+    except ValueError as error:
+        raise InputError(f"train: {words[:60]!r} cannot be read ({error})") from error
     kept = ("method", "direction", "start", "seed", "bounds", "out", "robot", "address", "runners")
     if named := [word for word in told if word.lstrip("-").partition("=")[0] in kept]:
         raise InputError(f"train: {named[0]} is the experiment's to say; leave it out")

@@ -155,6 +155,7 @@ class Player:
         self.body.limp()
         hold = "rope" if motion.support == "suspended" else "hand"
         self._say(cmd="reset", hold=hold, draw=draw)
+        self.body.guard.warm(0.0)  # whatever was played before
         self._enable(name)
         pose = self.body.goal
         self._stay(pose, STEADY, name)
@@ -187,7 +188,7 @@ class Player:
         begin, rows = self._time, list[Row]()
         for target, gap in zip(motion.target, gaps, strict=True):
             row = self._tick(target, float(gap), name)
-            rows.append(Row(row.time - begin, row.senses, row.applied))
+            rows.append(Row(round(row.time - begin, 6), row.senses, row.applied))
             if motion.motion == "fall" and _tilted(row):
                 break
         return rows

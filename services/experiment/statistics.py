@@ -73,10 +73,10 @@ def median(sample: Array) -> Array:
 
 
 def ratio(sample: Array) -> Array:
-    """Mean of the first column by that of the second; infinite where that is not above 0."""
+    """Mean of the first column by that of the second; infinite where only the first is above 0."""
     above, below = sample[..., 0].mean(axis=-1), sample[..., 1].mean(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(below > 0, above / below, np.inf))
+        return np.asarray(np.where(below > 0, above / below, np.where(above > 0, np.inf, 0.0)))
 
 
 def share_above(sample: Array) -> Array:

@@ -5,6 +5,7 @@ import contextlib
 import json
 import logging
 import signal
+import ssl
 import sys
 import time
 from pathlib import Path
@@ -68,7 +69,18 @@ def serve(config: Config) -> dict[str, Any]:
         log.warning("no token exists, so nobody can ask; pup serve token NAME --role admin")
     if not config.loopback and not config.certificate:
         log.warning("tokens travel unencrypted: set certificate and key, or use a TLS proxy")
+    _check_certificate(config)
     return asyncio.run(_run(config, tokens, ring))
+
+
+def _check_certificate(config: Config) -> None:
+    if not config.certificate:
+        return
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(config.certificate, config.key)
+    except OSError as error:  # of a file, or of what stands in it
+        why = error.strerror or error
+        raise InputError(f"certificate {config.certificate}, key {config.key}: {why}") from error
 
 
 async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
