@@ -33,8 +33,9 @@ lint: $(VENV)/.tested
 	$(BIN)/lint-imports
 
 # Two processes: fixtures of a file are made once, and no test runs in the one whose exit counts.
+# Files go out in the order of tests/conftest.py: the longest first, not those with the most tests.
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 20
 
 slow: $(VENV)/.tested
 	$(BIN)/python -m pytest -m slow

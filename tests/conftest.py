@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commandline import briefly_polished
 from hypothesis import settings
 from refusals import Place
 
@@ -21,6 +22,19 @@ settings.load_profile("patient")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(__file__).parents[2] / "shared"
+
+LONGEST = (
+    *("workers", "diagnosis", "jobs_ray", "cli", "blind_run", "training", "rivals"),
+    *("diagnose_job", "run_corrected", "run", "blind_sound", "agent_holds", "training_job"),
+    *("search", "reweighing", "transfer_job", "brax", "agent", "gateway_orders", "exhaustive"),
+)
+"""Files that take longest, which go first: after a long one that begins last, a worker is idle."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first, each with its tests in their order."""
+    rank = {f"test_{name}.py": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 
 
 @pytest.fixture(scope="session")
@@ -63,6 +77,13 @@ def bench_recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def place(tmp_path: Path, leg_recordings: Path, bench_recordings: Path) -> Place:
     """Where a case of bad input works."""
     return Place(tmp_path, leg_recordings, bench_recordings)
+
+
+@pytest.fixture
+def short_polish() -> Iterator[None]:
+    """Fits of this process, and of no other, do the least at their end."""
+    with briefly_polished():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -29,6 +30,14 @@ def recordings(
       noise: of readings, rad.
       late: how late commands arrive: mean and standard deviation, s.
     """
+    return _recordings(tuple(missing.items()), seed, noise, late)
+
+
+@cache
+def _recordings(
+    told: tuple[tuple[str, float], ...], seed: int, noise: float, late: tuple[float, float]
+) -> tuple[Recording, ...]:
+    missing = dict(told)
     rng = np.random.default_rng(seed)
     levels = rng.uniform(-0.6, 0.6, 8)
 

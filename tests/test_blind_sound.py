@@ -19,9 +19,10 @@ from pup.errors import InputError
 from pup.robot import RobotDescription
 
 QUIET = Noise(position=0.0, quantum=0.0)
-STEP_FREE = 2e-5  # rad, rms; the nominal motion itself changes as much with the step
-VANISHED, SAME = 0.05, 0.08  # shares of the change at typical size
-SWITCHED = 0.25  # the same of what jumps from level to level, at the next step at the earliest
+FINER = 4  # as many steps for one; an error linear in the step shows three quarters of itself
+STEP_FREE = 1.7e-5  # rad, rms; the nominal motion itself changes as much with the step
+VANISHED, SAME = 0.05, 0.07  # shares of the change at typical size
+SWITCHED = 0.21  # the same of what jumps from level to level, at the next step at the earliest
 SEEDS = 150
 BRIEF = 30  # ticks, up to a moment without torque
 DISTAL = Place("joint", ("l_ank_roll",))  # carries the lightest link
@@ -69,7 +70,7 @@ def test_effects_vanish_with_their_size_and_do_not_hang_on_the_step(
     monkeypatch.setattr("pup.blind.simulate.SETTLING", 0.1)
     monkeypatch.setattr("pup.blind.simulate.SLOW", 0.1)
     world = world_of(name)
-    fine = replace(world, engine=Engine(step=STEP / 8))
+    fine = replace(world, engine=Engine(step=STEP / FINER))
     shown = [shortened(plan) for plan in plans(world.robot, "bench")]
     nominal, exact = moved(world, shown), moved(fine, shown)
     for effect in names or (*available(Kit.of(world.robot, False)), *unlisted()):

@@ -117,7 +117,7 @@ def test_a_parameter_seen_on_one_side_alone_is_not_tested() -> None:
 
 def test_false_alarms_are_rare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a split, at most one run in twenty reports any, however many parameters it tests."""
-    monkeypatch.setattr(bounds, "PERMUTATIONS", 199)
+    monkeypatch.setattr(bounds, "PERMUTATIONS", 99)
     monkeypatch.setattr(bounds, "two_cluster_p", lambda *_: 1.0)
     rng = np.random.default_rng(9)
     space = ParameterSpace(

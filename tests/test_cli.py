@@ -139,6 +139,7 @@ def test_presysid_writes_bounds_and_a_report(
     assert bounds == known
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_presysid_takes_more_generations_of_the_same_search(
     bench_recordings: Path, identified: Path, tmp_path: Path
 ) -> None:
@@ -161,6 +162,7 @@ def test_presysid_takes_more_generations_of_the_same_search(
         assert len(history) >= 3
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_presysid_begins_where_it_is_told_to(
     bench_recordings: Path, identified: Path, tmp_path: Path
 ) -> None:
@@ -180,6 +182,7 @@ def test_presysid_begins_where_it_is_told_to(
     assert options["start"] == hashlib.sha256(start.read_bytes()).hexdigest()
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_presysid_takes_the_torque_law_that_a_robot_has(tmp_path: Path, check: Check) -> None:
     """The EMPS has no network: no option is needed to say so."""
     record = ("record", "step:0.1", "--virtual", "--robot", "emps", "--out", tmp_path / "rec")
@@ -224,6 +227,7 @@ def test_replay_without_bounds_takes_those_of_the_robot(
     assert pup(*command).json()["model"] == str(robot / "identified.json")
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_run_keeps_finished_stages_and_does_again_what_changed(
     bench_recordings: Path, tmp_path: Path, check: Check
 ) -> None:
@@ -260,6 +264,7 @@ def test_run_keeps_finished_stages_and_does_again_what_changed(
     assert repaired.json()["presysid"]["parameters"] == changed.json()["presysid"]["parameters"]
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_run_does_again_what_another_recording_changes(
     bench_recordings: Path, tmp_path: Path
 ) -> None:

@@ -341,16 +341,9 @@ def test_refuses(place: Place, name: str) -> None:
     check(place, case[name](place))
 
 
-PROCESSES = (
-    "diagnose: recordings of another robot",
-    "diagnose: a Parquet file cut off",
-    "blind make: an unknown robot",
-    "blind run: a folder that is no set",
-    "blind score: another key",
+@pytest.mark.parametrize(
+    "name", ["diagnose: a Parquet file cut off", "blind run: a folder that is no set"]
 )
-
-
-@pytest.mark.parametrize("name", PROCESSES)
 def test_refuses_in_a_process_of_its_own(place: Place, name: str) -> None:
     command, words = case[name](place)
     before = files(place.here)

@@ -8,7 +8,7 @@ from pathlib import Path
 import foreign_logs
 import numpy as np
 import pytest
-from commandline import TINY, files, pup, pup_process
+from commandline import TINY, briefly_polished, files, pup, pup_process
 from refusals import LOG, TOLD, Cases, Made, Place, assert_refused, check
 
 from pup.robot import RobotDescription
@@ -234,7 +234,8 @@ def test_refuses_to_mix_recordings_of_virtual_robots(place: Place) -> None:
 def identified(bench_recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `pup presysid` leaves of the bench's recordings."""
     out = tmp_path_factory.mktemp("identified")
-    done = pup("presysid", bench_recordings, "--robot", "servo_bench", "--out", out, *TINY)
+    with briefly_polished():
+        done = pup("presysid", bench_recordings, "--robot", "servo_bench", "--out", out, *TINY)
     assert done.code == 0, done.err
     return out
 

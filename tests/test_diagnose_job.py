@@ -8,22 +8,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from blind_sets import FRICTION, motions, poor
+from blind_sets import FRICTION, motions, poor, shortened
 from commandline import pup
-from diagnosis_cases import BENCH
+from diagnosis_cases import BENCH, recordings
 from jobs import Job
 from numpy.typing import NDArray
 
 from pup.diagnosis.replays import Batch, Bench, Replays, Runner, threads
 from pup.diagnosis.residuals import Measured
 from pup.physics.parameters import robot_space
-from pup.recording import load_recordings, write_recordings
+from pup.recording import write_recordings
 from pup.recording_cuts import beginning
 from services.diagnosis import Where, alone, keeper, run_diagnosis
 from services.stopwatch import Stopwatch
 
 STOPPED = "pup diagnose: stopped; the same command resumes\n"
 RAY = ("--cores", 2)
+DIAGNOSE = ("--robot", "servo_bench", "--effects", 1)
 KEPT = "checkpoints/*.f32"
 TIMES = ("seconds", "processor_seconds", "corrected_robot")
 
@@ -37,7 +38,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def diagnose(runs: Path, out: Path, *where: object) -> Job:
-    return Job("diagnose", runs, "--robot", "servo_bench", *where, out=out)
+    return Job("diagnose", runs, *DIAGNOSE, *where, out=out)
 
 
 def told(out: Path) -> Any:
@@ -50,7 +51,7 @@ def told(out: Path) -> Any:
 def wanted(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What an undisturbed run leaves, in one process."""
     out = tmp_path_factory.mktemp("undisturbed")
-    done = pup("diagnose", runs, "--robot", "servo_bench", "--local", "--cores", 1, "--out", out)
+    done = pup("diagnose", runs, *DIAGNOSE, "--local", "--cores", 1, "--out", out)
     assert done.code == 0, done.err
     lines = done.err.splitlines()
     assert any(x.startswith("refits, ") and " at joint:servo found: 5" in x for x in lines)
@@ -76,7 +77,7 @@ def test_it_tells_how_long_it_took(wanted: Path) -> None:
 
 
 def test_killed_again_and_again(runs: Path, tmp_path: Path, wanted: Path) -> None:
-    for kept in (3, 12, 30):
+    for kept in (3, 30):
         job = diagnose(runs, tmp_path, "--local", "--cores", 1)
         job.come_to(KEPT, kept)
         job.process.kill()
@@ -155,13 +156,15 @@ def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path
     assert not np.array_equal(answers[0], answers[1])
 
 
-def test_the_beginning_of_long_recordings_is_enough(runs: Path, tmp_path: Path) -> None:
+def test_the_beginnings_of_recordings_can_be_taken_alone(tmp_path: Path) -> None:
     """`--seconds`: the page says of what it is."""
-    where = ("--local", "--effects", 1, "--seconds", 1.2, "--out", tmp_path)
-    done = pup("diagnose", runs, "--robot", "servo_bench", *where)
+    two = [shortened(recordings({}, 1)[number], 40) for number in (0, 2)]
+    write_recordings(two, tmp_path / "runs")
+    where = ("--local", "--seconds", 1, "--out", tmp_path / "out")
+    done = pup("diagnose", tmp_path / "runs", *DIAGNOSE, *where)
     assert done.code == 0, done.err
-    page = (tmp_path / "report.html").read_text()
-    for recording in load_recordings([runs]):
-        cut = beginning(recording, 1.2)
-        assert cut.time[-1] - cut.time[0] < 1.2 < recording.time[-1] - recording.time[0]
+    page = (tmp_path / "out" / "report.html").read_text()
+    for recording in two:
+        cut = beginning(recording, 1.0)
+        assert cut.time[-1] - cut.time[0] < 1.0 < recording.time[-1] - recording.time[0]
         assert cut.digest in page and recording.digest not in page

@@ -38,6 +38,7 @@ def test_the_example_is_a_robot(folder: Path) -> None:
     assert robot.setup({"payload": 0.2}) == {"payload": 0.2}
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_the_commands_of_the_page_work(folder: Path) -> None:
     commands, *_ = blocks("robots.md", "sh")
     for command in commands.splitlines():

@@ -6,11 +6,12 @@ import pytest
 from benchmarks.exhaustive import Cost, cost
 from benchmarks.rivals.case import Case
 from pup.diagnosis.hypotheses import hypotheses
-from tests.diagnosis_cases import BENCH, recordings
+from tests.blind_sets import FRICTION, motions
+from tests.diagnosis_cases import BENCH
 
 
 def test_the_cost_of_all_is_told_from_some() -> None:
-    case = Case.of(BENCH, recordings({"coulomb_friction/torque@joint:servo": 0.03})[:3])
+    case = Case.of(BENCH, motions(FRICTION)[0][:3])
     told = cost(case, 2, seed=1)
     assert told.effects == len(hypotheses(case.measured))
     assert (told.each > len(case.nominal.fit.at)).all()  # a Jacobian at least

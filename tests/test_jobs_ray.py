@@ -154,7 +154,7 @@ def test_cancel_leaves_nothing_behind(service, shared):
 
 
 def test_a_job_goes_on_while_the_gateway_is_away(service, shared):
-    job = submitted(service, "presysid", "recordings", *SHORT)
+    job = submitted(service, "presysid", "recordings", *SHORT, "--local", "--cores", "1")
     wait_for(service, job, "running", "waiting")
     service.kill()
     service.start()

@@ -46,6 +46,7 @@ def test_servo_gains_of_a_leg_are_recovered(tmp_path: Path) -> None:
     assert bounds.identified[gains].all()
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_what_a_suspended_robot_cannot_tell_is_said_so(tmp_path: Path) -> None:
     """Ground friction and the torso's mass do nothing in the air: unidentified, whole range."""
     space = robot_space(RobotDescription.load("darwin_op2"), "nn_pd")

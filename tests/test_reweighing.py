@@ -14,7 +14,7 @@ from pup.diagnosis.nominal import Nominal, certified, fit_nominal
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.reweighing import Reweighing
-from pup.diagnosis.search import search, search_on
+from pup.diagnosis.search import Search, search, search_on
 from pup.physics.parameters import robot_space
 from pup.robot import RobotDescription
 from tests.diagnoses import Maker
@@ -75,21 +75,30 @@ def weighed(nominal: Nominal, by: Noise) -> Nominal:
     return replace(nominal, fit=fit, noise=by)
 
 
-def test_a_search_goes_on_to_where_one_anew_leads(nominal: Nominal) -> None:
+@pytest.fixture(scope="module")
+def searched(nominal: Nominal) -> tuple[Search, int]:
+    """A search, and how many replays it took."""
+    before = bench().simulated
+    done = search(bench(), nominal, np.random.default_rng(1), quiet)
+    assert done is not None
+    return done, bench().simulated - before
+
+
+def test_a_search_goes_on_to_where_one_anew_leads(
+    nominal: Nominal, searched: tuple[Search, int]
+) -> None:
     replays, right = bench(), nominal.noise
+    anew, spent = searched
     wrong = replace(right, sigma=1.4 * right.sigma, rho=np.full_like(right.rho, 0.3))
     done = search(replays, weighed(nominal, wrong), np.random.default_rng(1), quiet)
     assert done is not None
-    before = replays.simulated
-    anew = search(replays, nominal, np.random.default_rng(1), quiet)
     between = replays.simulated
     further = search_on(done, replays, nominal, np.random.default_rng(1), quiet)
-    assert anew is not None
     assert [h.key for h in further.model.hypotheses] == [h.key for h in anew.model.hypotheses]
     assert [h.effect for h in further.model.hypotheses] == ["coulomb_friction"]
     assert further.model.fit.chi2 == pytest.approx(anew.model.fit.chi2, rel=2e-3)
     assert further.enough == pytest.approx(anew.enough, rel=0.3)
-    assert replays.simulated - between < (between - before) / 2
+    assert replays.simulated - between < spent / 2
     (chosen,) = (r for r in further.rounds if r.accepted)
     assert chosen.before is further.selector.nominal
     assert chosen.chosen.effect == "coulomb_friction"
@@ -100,12 +109,14 @@ def test_a_search_goes_on_to_where_one_anew_leads(nominal: Nominal) -> None:
         assert fit.chi2 == pytest.approx(float(white @ white), rel=1e-6)
 
 
-def test_what_was_found_by_too_little_noise_is_given_up(nominal: Nominal) -> None:
+def test_what_was_found_by_too_little_noise_is_given_up(
+    nominal: Nominal, searched: tuple[Search, int]
+) -> None:
     """Where the noise turns out to be a hundred times as large, nothing stands out any more."""
     replays, right = bench(), nominal.noise
     loud = replace(right, sigma=100 * right.sigma)
-    done = search(replays, nominal, np.random.default_rng(1), quiet)
-    assert done is not None
+    done, _ = searched
+    assert done.model.hypotheses
     further = search_on(done, replays, weighed(nominal, loud), np.random.default_rng(1), quiet)
     assert not further.model.hypotheses
     assert further.model is further.selector.nominal

@@ -48,7 +48,13 @@ class Done:
 def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     out = tmp_path_factory.mktemp("rivals")
     document = run_diagnosis(
-        BENCH, recordings(FRICTION), out, alone(1), lambda stage, share: None, rivals=True
+        BENCH,
+        recordings(FRICTION),
+        out,
+        alone(1),
+        lambda stage, share: None,
+        rivals=True,
+        effects=1,
     )
     return Done(document, out)
 
@@ -108,6 +114,19 @@ def bench() -> Maker:
     return Maker(replace(BENCH, network=None), ticks=100)
 
 
+@pytest.fixture
+def one_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where one tells as much as the mean of several."""
+    monkeypatch.setattr("pup.diagnosis.residual_network.MEMBERS", 1)
+
+
+@pytest.fixture
+def short_training(one_network: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it does not matter how well it learns."""
+    monkeypatch.setattr("pup.diagnosis.residual_network.STEPS", 300)
+
+
+@pytest.mark.usefixtures("short_training")
 def test_a_robot_without_a_network_has_one_rival_less(bench: Maker) -> None:
     found = bench.nothing()
 
@@ -121,6 +140,7 @@ def test_a_robot_without_a_network_has_one_rival_less(bench: Maker) -> None:
     assert set(told.better) == {"nominal", "residual_network"}
 
 
+@pytest.mark.usefixtures("short_training")
 def test_one_seed_leads_to_one_result(bench: Maker) -> None:
     from pup.diagnosis.residual_network import mend
 
@@ -134,6 +154,7 @@ def test_one_seed_leads_to_one_result(bench: Maker) -> None:
     assert (first != other)[inside].all()
 
 
+@pytest.mark.usefixtures("one_network")
 def test_the_network_learns_an_error_that_carries_over(bench: Maker) -> None:
     """One that grows with velocity, on motions alike: the fold left out is mended too."""
     from pup.diagnosis.residual_network import features, mend

@@ -226,6 +226,7 @@ def test_a_robot_is_not_written_over_itself(tmp_path: Path) -> None:
         write_corrected(robot, tmp_path, {}, ())
 
 
+@pytest.mark.usefixtures("short_polish")
 def test_every_verb_takes_a_corrected_robot_and_leaves_its_terms(
     tmp_path: Path, bench_recordings: Path
 ) -> None:

@@ -17,7 +17,7 @@ from pup.diagnosis.residuals import Measured
 from pup.diagnosis.search import followed, search
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
-from tests.blind_sets import FRICTION
+from tests.blind_sets import ENOUGH, FRICTION, shortened
 from tests.diagnosis_cases import BENCH, recordings
 
 
@@ -107,7 +107,7 @@ def test_where_too_few_are_left_all_are_taken(runs: tuple[Recording, ...]) -> No
 
 def test_where_nothing_more_is_looked_for_a_first_look_is_not_scored_again() -> None:
     """With all motions its model is fitted, and its traces stand for those of all."""
-    measured = Measured.of(BENCH, recordings(FRICTION))
+    measured = Measured.of(BENCH, [shortened(run, ENOUGH) for run in recordings(FRICTION)])
     replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
     rng = np.random.default_rng(0)
     nominal = certified(fit_nominal(replays, assumed_noise(measured), rng), replays, rng)
