@@ -96,7 +96,7 @@ def test_killed_while_it_looks_and_while_it_corrects_it_ends_the_same(
 ) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert pup(*command, "--out", whole).code == 0
-    for moment in ("diagnosis/checkpoints/*.f32", "corrected/presysid/checkpoints/*.npz"):
+    for moment in ("diagnosis/checkpoints/*.f32", "corrected/presysid/checkpoints/subsets-*/*.npz"):
         job = Job(*command, out=parts)
         job.come_to(moment)
         job.process.kill()
