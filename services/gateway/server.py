@@ -56,6 +56,7 @@ def serve(config: Config) -> dict[str, Any]:
     Raises:
       InputError: a setting, a file or an address cannot be used.
     """
+    _check_certificate(config)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     logging.basicConfig(level=config.log.upper(), handlers=[handler], force=True)
@@ -69,7 +70,6 @@ def serve(config: Config) -> dict[str, Any]:
         log.warning("no token exists, so nobody can ask; pup serve token NAME --role admin")
     if not config.loopback and not config.certificate:
         log.warning("tokens travel unencrypted: set certificate and key, or use a TLS proxy")
-    _check_certificate(config)
     return asyncio.run(_run(config, tokens, ring))
 
 
