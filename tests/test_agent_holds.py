@@ -37,17 +37,27 @@ def enabled(made: Lab) -> None:
     wait(tried, 20, made.log)
 
 
+def pull_port(made: Lab) -> None:
+    """Take the adapter out, and wait until the agent knows."""
+    made.side(cmd="fault", kind="port_pulled")
+    wait(lambda: not made.health()["bus"]["works"], 20, made.log)
+
+
+def plug_port(made: Lab) -> None:
+    """Put it in again, and wait until the agent has found it."""
+    made.side(cmd="fault", kind="port_pulled", off=True)
+    wait(lambda: made.health()["bus"]["works"], 20, made.log)
+
+
 def test_an_enable_that_was_refused_is_not_done_later(tmp_path: Path) -> None:
     """The port is gone, `enable` is refused, somebody presses stop; then the port comes back."""
     with lab(tmp_path) as made:
         made.start()
-        made.side(cmd="fault", kind="port_pulled")
-        wait(lambda: not made.health()["bus"]["works"], 20, made.log)
+        pull_port(made)
         with pytest.raises(InputError, match="the control loop does not run"):
             made.say("enable")
         made.say("stop")
-        made.side(cmd="fault", kind="port_pulled", off=True)
-        wait(lambda: made.health()["bus"]["works"], 20, made.log)
+        plug_port(made)
         time.sleep(0.5)
         assert made.health()["state"] != "enabled"
         assert holding(made) == 0
@@ -57,16 +67,14 @@ def test_what_was_asked_before_a_stop_is_not_done_after_it(tmp_path: Path) -> No
     """Two `enable` wait, one in the loop and one for it; somebody presses stop."""
     with lab(tmp_path) as made:
         made.start()
-        made.side(cmd="fault", kind="port_pulled")
-        wait(lambda: not made.health()["bus"]["works"], 20, made.log)
+        pull_port(made)
         with ThreadPoolExecutor(2) as pool:
             asked = [pool.submit(made.say, "enable") for _ in range(2)]
             time.sleep(0.5)
             made.say("stop")
             told = [str(one.exception(timeout=20)) for one in asked]
         assert sorted("ask again" in words for words in told) == [False, True], told
-        made.side(cmd="fault", kind="port_pulled", off=True)
-        wait(lambda: made.health()["bus"]["works"], 20, made.log)
+        plug_port(made)
         time.sleep(0.5)
         assert holding(made) == 0
 
@@ -74,10 +82,8 @@ def test_what_was_asked_before_a_stop_is_not_done_after_it(tmp_path: Path) -> No
 def test_the_watchdog_finds_an_adapter_that_was_out_and_in_again(tmp_path: Path) -> None:
     with lab(tmp_path) as made:
         made.start()
-        made.side(cmd="fault", kind="port_pulled")
-        wait(lambda: not made.health()["bus"]["works"], 20, made.log)
-        made.side(cmd="fault", kind="port_pulled", off=True)
-        wait(lambda: made.health()["bus"]["works"], 20, made.log)
+        pull_port(made)
+        plug_port(made)
         enabled(made)
         assert holding(made) == 20
         made.kill()

@@ -15,12 +15,18 @@ from pup.files import write_json
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
 from services.job_report import Job, found, write_report
-from services.mission import TRIALS
+from services.mission import TRIALS, Means
 from services.pipeline import POLICIES
 from services.stages import Done, Journal, Stage
 from tests.reports import Page
 
 DARWIN = RobotDescription.load("darwin_op2")
+
+
+def idle() -> Means:
+    """The means of a job of which no stage is run."""
+    nothing = [None] * 6
+    return Means(*nothing, print, 1)  # type: ignore[arg-type]
 
 
 class Counter:
@@ -114,16 +120,14 @@ def test_what_a_robot_cannot_do_is_refused_before_anything_is_done(
 
 def test_a_virtual_robot_walks_for_no_other(tmp_path: Path) -> None:
     """Its walks would be diagnosed together with recordings of a robot that it knows nothing of."""
-    from services.mission import Means, Mission, default_recordings
+    from services.mission import Mission, default_recordings
     from services.pipeline import _Job
     from services.presysid import Options
-
-    means = Means(*[None] * 6, print, 1)  # type: ignore[arg-type]  # no stage is run
 
     def job(source: str, trials: int | None) -> _Job:
         *others, last = default_recordings(DARWIN)
         recordings = [*others, replace(last, source=source)]
-        return _Job(DARWIN, recordings, Mission(Options(), 1000, trials), tmp_path, means)
+        return _Job(DARWIN, recordings, Mission(Options(), 1000, trials), tmp_path, idle())
 
     assert job("simulation", None).trials == TRIALS
     real = job("hardware", None)
@@ -135,7 +139,7 @@ def test_a_virtual_robot_walks_for_no_other(tmp_path: Path) -> None:
 def test_a_shipped_policy_is_started_from_where_there_is_one(
     tmp_path: Path,
 ) -> None:
-    from services.mission import Means, Mission
+    from services.mission import Mission
     from services.pipeline import Half, _Job
     from services.presysid import Options
 
@@ -148,11 +152,8 @@ def test_a_shipped_policy_is_started_from_where_there_is_one(
 
     def start() -> Path | None:
         robot = RobotDescription.load(folder)
-        nothing = [None] * 6  # no stage is run
-        means = Means(*nothing, print, 1)  # type: ignore[arg-type]
-        return _Job(robot, (), Mission(Options(), 1000, 0), out, means)._start(
-            Half(robot, Options())
-        )
+        job = _Job(robot, (), Mission(Options(), 1000, 0), out, idle())
+        return job._start(Half(robot, Options()))
 
     assert start() is None
     shipped = agents.bundle(folder / POLICIES / "forward", parameters=names)
