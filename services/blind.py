@@ -41,8 +41,8 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     wanted, commitment = orders(options.set, options.out, options.limit)
     journal = Journal(options.out, commitment)
     if not all(order.done for order in wanted):
-        with places.cases(options) as (each, lanes), counted("blind run") as tell:
-            run_cases(wanted, journal, each, lanes, tell)
+        with places.cases(options) as (pools, lanes), counted("blind run") as tell:
+            run_cases(wanted, journal, pools, lanes, tell)
     return {"cases": len(wanted), "out": str(options.out), **journal.document()}
 
 

@@ -17,7 +17,7 @@ from pup.robot import RobotDescription, built_in_robots
 from services.blind_journal import JOURNAL, Journal
 from services.diagnosis import DIAGNOSIS, alone, run_diagnosis
 from services.failures import ERROR, caught, lost, mended, named
-from services.places import Each
+from services.places import Pools
 
 SEED = 0
 
@@ -88,7 +88,7 @@ def cases_of(folder: Path, limit: int | None) -> list[Path]:
 
 
 def run_cases(
-    wanted: Sequence[Order], journal: Journal, each: Each, lanes: int, tell: Tell
+    wanted: Sequence[Order], journal: Journal, pools: Pools, lanes: int, tell: Tell
 ) -> None:
     """Diagnose the cases that have no diagnosis yet.
 
@@ -97,7 +97,7 @@ def run_cases(
     Args:
       wanted: the cases.
       journal: of the run.
-      each: does them, several at once.
+      pools: of what does them, several at once.
       lanes: how many at once.
       tell: told how many are done.
 
@@ -109,10 +109,13 @@ def run_cases(
     failed: dict[str, str] = {}
     done, share = len(wanted) - len(todo), 0.0
     whole = sum(order.weight for order in todo)
-    with journal.session(lanes, failed), closing(each(diagnose_case, todo)) as outcomes:
+    with journal.session(lanes, failed), closing(pools(diagnose_case)) as pool:
         tell(done, len(wanted))
-        for i, outcome in outcomes:
-            order, told = todo[i], _settled(todo[i], outcome)
+        for order in todo:
+            pool.begin(order)
+        for _ in todo:
+            order, outcome = pool.settled()
+            told = _settled(order, outcome)
             if told.error:
                 failed[order.name] = told.error
             done += not told.error

@@ -2,15 +2,32 @@
 
 import argparse
 import os
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 from pup.errors import InputError
 
-Each = Callable[[Callable[[Any], Any], Sequence[Any]], Generator[tuple[int, Any], None, None]]
-"""Does a job for each of some things, and yields their places in the list and the outcomes as they
-come; the outcome of a job whose process was lost is an exception."""
+
+class Pool(Protocol):
+    """Does a job for things, several at once."""
+
+    def begin(self, item: Any) -> None:
+        """Do it for a thing when its turn comes."""
+        ...
+
+    def settled(self) -> tuple[Any, Any]:
+        """The next thing that is done and the outcome; an exception where the process was lost."""
+        ...
+
+    def close(self) -> None:
+        """End what runs."""
+        ...
+
+
+Pools = Callable[[Callable[[Any], Any]], Pool]
+"""Makes a pool for a job."""
 
 
 def cores(options: argparse.Namespace) -> int:
@@ -61,22 +78,34 @@ def replays(options: argparse.Namespace) -> Iterator[Any]:
 
 
 @contextmanager
-def cases(options: argparse.Namespace) -> Iterator[tuple[Each, int]]:
+def cases(options: argparse.Namespace) -> Iterator[tuple[Pools, int]]:
     """Where whole cases are worked on, each on one core, and how many at once."""
     if options.local:
-        yield one_by_one, 1
+        yield OneByOne, 1
         return
-    from workers.cases import on_ray
+    from workers.cases import RayPool
     from workers.cluster import connected
     from workers.hypotheses import lanes
 
     with connected(options.address, options.cores):
-        yield on_ray, lanes()
+        yield RayPool, lanes()
 
 
-def one_by_one(
-    job: Callable[[Any], Any], items: Sequence[Any]
-) -> Generator[tuple[int, Any], None, None]:
-    """See Each; in this process."""
-    for i, item in enumerate(items):
-        yield i, job(item)
+class OneByOne:
+    """See Pool; in this process, one after the other."""
+
+    def __init__(self, job: Callable[[Any], Any]) -> None:
+        self._job, self.waiting = job, deque[Any]()
+
+    def begin(self, item: Any) -> None:
+        """See Pool."""
+        self.waiting.append(item)
+
+    def settled(self) -> tuple[Any, Any]:
+        """See Pool."""
+        item = self.waiting.popleft()
+        return item, self._job(item)
+
+    def close(self) -> None:
+        """See Pool."""
+        self.waiting.clear()

@@ -5,7 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,11 @@ from diagnosis_cases import recordings
 from jobs import Job
 
 from pup.files import read_json, write_json
+from services import blind_run
 from services.blind_journal import Journal
 from services.blind_run import Order, diagnose_case, orders, run_cases
-from workers.cases import on_ray
+from services.places import OneByOne
+from workers.cases import RayPool
 from workers.cluster import connected
 
 TIMES = ("seconds", "processor_seconds", "corrected_robot")
@@ -204,12 +206,12 @@ def test_a_case_whose_process_is_lost_is_recorded(quick: Path) -> None:
     out.mkdir()
     found, commitment = orders(quick / "set", out, None)
 
-    def each(job: Any, todo: Any) -> Iterator[tuple[int, Any]]:
-        for i, _ in enumerate(todo):
-            yield i, RuntimeError("The worker died.\nIt left nothing.")
+    class Lost(OneByOne):
+        def settled(self) -> tuple[Any, Any]:
+            return self.waiting.popleft(), RuntimeError("The worker died.\nIt left nothing.")
 
     with pytest.raises(ValueError, match=r"3 of 3 cases failed.*case_a \(RuntimeError: The worker"):
-        run_cases(found, Journal(out, commitment), each, 1, lambda *_: None)
+        run_cases(found, Journal(out, commitment), Lost, 1, lambda *_: None)
     error = read_json(out / "case_b" / "error.json")
     assert error["details"] == ["The worker died.", "It left nothing."]
 
@@ -220,11 +222,12 @@ def test_the_longest_case_is_the_first(tmp_path: Path) -> None:
     found, commitment = orders(tmp_path / "set", tmp_path / "out", None)
     begun: list[Order] = []
 
-    def each(job: Any, todo: Any) -> Iterator[tuple[int, Any]]:
-        begun.extend(todo)
-        yield from ()
+    class Watched(OneByOne):
+        def settled(self) -> tuple[Any, Any]:
+            begun.append(self.waiting.popleft())
+            return begun[-1], blind_run.Outcome("consistent", 1.0)
 
-    run_cases(found, Journal(tmp_path / "out", commitment), each, 1, lambda *_: None)
+    run_cases(found, Journal(tmp_path / "out", commitment), Watched, 1, lambda *_: None)
     assert begun[0].name == "case_b"
 
 
@@ -237,8 +240,12 @@ def test_a_job_that_kills_its_worker_is_given_up() -> None:
             raise ValueError("no")
         return 10 * item
 
-    with connected(cores=2):
-        outcomes = dict(on_ray(job, range(4)))
+    with connected(cores=2), closing(RayPool(job)) as pool:
+        for item in range(4):
+            pool.begin(item)
+        outcomes = dict(pool.settled() for _ in range(4))
+        with pytest.raises(LookupError):
+            pool.settled()
     assert (outcomes[0], outcomes[3]) == (0, 30)
     assert isinstance(outcomes[1], Exception) and isinstance(outcomes[2], Exception)
 

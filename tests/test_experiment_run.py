@@ -65,7 +65,7 @@ def workshop(monkeypatch: pytest.MonkeyPatch) -> Workshop:
 
 
 def do(cells: dict[str, Cell], out: Path) -> dict[str, str]:
-    return run_cells(cells, out, places.one_by_one, 1, told)
+    return run_cells(cells, out, places.OneByOne, told)
 
 
 def test_cells_are_done_once_and_again_when_something_changed(
@@ -86,6 +86,40 @@ def test_cells_are_done_once_and_again_when_something_changed(
     workshop.done.clear()
     assert do(graph(plan), tmp_path) == {}
     assert workshop.done == ["presysid-r1000"]
+
+
+def test_no_cell_waits_for_one_that_it_does_not_need(workshop: Workshop, tmp_path: Path) -> None:
+    cells, slow = graph(small()), "presysid-r1001"
+
+    class SlowPool(places.OneByOne):
+        def settled(self) -> tuple[Any, Any]:
+            while self.waiting[0].cell.name == slow and len(self.waiting) > 1:
+                self.waiting.rotate(-1)
+            return super().settled()
+
+    assert run_cells(cells, tmp_path, SlowPool, told) == {}
+    behind = {slow}
+    for cell in cells.values():
+        if behind.intersection(cell.needs.values()):
+            behind.add(cell.name)
+    assert {"trials-r1000-forward-pup", "trials-r1000-forward-corrected"}.isdisjoint(behind)
+    after = workshop.done[workshop.done.index(slow) :]
+    assert set(after) == behind
+
+
+def test_the_longest_way_is_begun_first(workshop: Workshop, tmp_path: Path) -> None:
+    cells = graph(small())
+    begun: list[str] = []
+
+    class Watched(places.OneByOne):
+        def begin(self, item: Any) -> None:
+            begun.append(item.cell.name)
+            super().begin(item)
+
+    run_cells(cells, tmp_path, Watched, told)
+    assert begun[0].startswith("record-r")
+    ends = {n for n in cells if not any(n in c.needs.values() for c in cells.values())}
+    assert set(begun[-2:]) <= ends
 
 
 def test_what_needs_another_result_is_done_again(workshop: Workshop, tmp_path: Path) -> None:
@@ -135,7 +169,7 @@ def test_a_cell_is_done_again_beside_what_it_left(workshop: Workshop, tmp_path: 
     cells, name = graph(small()), "trials-r1000-forward-robust"
 
     def again() -> dict[str, Any]:
-        return run_again(cells, name, tmp_path, places.one_by_one, 1, told)
+        return run_again(cells, name, tmp_path, places.OneByOne, told)
 
     first = again()  # as on a fresh clone: what it needs is done too, and nothing else
     assert first["agree"] and set(workshop.done) == set(needed(cells, name))
@@ -146,7 +180,7 @@ def test_a_cell_is_done_again_beside_what_it_left(workshop: Workshop, tmp_path: 
     assert len({*second["results"].values()}) == 2
     assert do(cells, tmp_path) == {}
     with pytest.raises(InputError, match="there is none"):
-        run_again(cells, "walk", tmp_path, places.one_by_one, 1, told)
+        run_again(cells, "walk", tmp_path, places.OneByOne, told)
 
 
 def needed(cells: dict[str, Cell], name: str) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Cells, done once each: in waves of those that need nothing more, several at once.
+"""Cells, done once each: several at once, each as soon as what it needs is there.
 
 Every cell has a folder of its own with a journal, so that no two write to one file, and whatever
 was interrupted goes on where it was.
@@ -20,7 +20,7 @@ from pup.files import read_json, sha256, write_json
 from services.experiment.cells import Cell, chosen
 from services.experiment.work import KINDS, LEFT, RESULT, Task
 from services.failures import ERROR, SHOWN, caught, lost, mended, named
-from services.places import Each
+from services.places import Pools
 from services.progress import Told
 from services.provenance import engine, now
 from services.stages import Journal, Stage
@@ -102,52 +102,85 @@ class Outcome:
     error: str = ""
 
 
-def run_cells(
-    cells: Mapping[str, Cell], out: Path, each: Each, lanes: int, tell: Told
-) -> dict[str, str]:
-    """Do the cells that are not done, and those that need them after them.
+class _Agenda:
+    """What is left to be done.
+
+    Attributes:
+      cells: all, each after those that it needs.
+      left: those of which nothing is known yet.
+      done: those that are there.
+      failed: those that are not to be had, and why.
+      whole: of all the work, what was not there at the beginning.
+      spent: of it, what is done or failed.
+    """
+
+    def __init__(self, cells: Mapping[str, Cell], out: Path) -> None:
+        self.cells, self.out = cells, out.absolute()
+        self.left, self.done, self.failed = dict(cells), set[str](), dict[str, str]()
+        self.whole, self.spent = sum(cell.weight for cell in cells.values()), 0.0
+        self._way: dict[str, float] = {}
+        for cell in reversed(cells.values()):
+            way = self._way.setdefault(cell.name, 0.0) + cell.weight
+            self._way[cell.name] = way
+            for need in cell.needs.values():
+                self._way[need] = max(way, self._way.get(need, 0.0))
+
+    def due(self) -> list[Order]:
+        """Cells that can be begun since this was last asked, the longest way to the end first."""
+        due = []
+        for cell in list(self.left.values()):
+            if missing := [need for need in cell.needs.values() if need in self.failed]:
+                self.settle(self.left.pop(cell.name), f"needs {missing[0]}")
+            elif self.done.issuperset(cell.needs.values()):
+                order = Order(self.left.pop(cell.name), self.out)
+                if order.done:
+                    self.done.add(cell.name)
+                    self.whole -= cell.weight
+                else:
+                    due.append(order)
+        return sorted(due, key=lambda order: -self._way[order.cell.name])
+
+    def settle(self, cell: Cell, error: str) -> None:
+        """A cell is done, or failed where there is an error."""
+        self.spent += cell.weight
+        if error:
+            self.failed[cell.name] = error
+        else:
+            self.done.add(cell.name)
+
+    @property
+    def share(self) -> float:
+        """Of the work, what is done."""
+        return self.spent / self.whole if self.whole else 1.0
+
+
+def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) -> dict[str, str]:
+    """Do the cells that are not done.
 
     Args:
       cells: each after those that it needs.
       out: folder of the experiment.
-      each: does several at once.
-      lanes: how many.
+      pools: of what does several at once.
       tell: told how many are done.
 
     Returns:
       The cells that failed, or could not be done as others had failed, and why.
     """
-    left, failed, share = dict(cells), dict[str, str](), 0.0
-    whole = sum(cell.weight for cell in cells.values())
-    while left:
-        ready = [c for c in left.values() if not any(n in left for n in c.needs.values())]
-        for cell in ready:
-            del left[cell.name]
-        orders = [Order(cell, out.absolute()) for cell in ready if not _blocked(cell, failed)]
-        kept = {order.cell.name: order.done for order in orders}
-        todo = [order for order in orders if not kept[order.cell.name]]
-        todo.sort(key=lambda order: -order.cell.weight)
-        whole -= sum(order.cell.weight for order in orders if kept[order.cell.name])
-        done = len(cells) - len(left) - len(failed) - len(todo)
-        tell(done, len(cells))
-        with closing(each(work_on, todo)) as outcomes:
-            for i, outcome in outcomes:
-                order, told = todo[i], _settled(todo[i], outcome)
-                share += order.cell.weight / max(whole, order.cell.weight)
-                done += not told.error
-                if told.error:
-                    failed[order.cell.name] = told.error
-                note = f"failed, {told.error}" if told.error else f"in {told.seconds:.0f} s"
-                tell(done, len(cells), f"{order.cell.name} {note}", share)
-    return failed
-
-
-def _blocked(cell: Cell, failed: dict[str, str]) -> bool:
-    """Whether something that a cell needs has failed; it then has failed too."""
-    missing = [name for name in cell.needs.values() if name in failed]
-    if missing:
-        failed[cell.name] = f"needs {missing[0]}"
-    return bool(missing)
+    agenda, running, note = _Agenda(cells, out), 0, ""
+    with closing(pools(work_on)) as pool:
+        while True:
+            for order in agenda.due():
+                pool.begin(order)
+                running += 1
+            tell(len(agenda.done), len(cells), note, agenda.share)
+            if not running:
+                return agenda.failed
+            order, outcome = pool.settled()
+            running -= 1
+            told = _settled(order, outcome)
+            agenda.settle(order.cell, told.error)
+            end = f"failed, {told.error}" if told.error else f"in {told.seconds:.0f} s"
+            note = f"{order.cell.name} {end}"
 
 
 def work_on(order: Order) -> Outcome:
@@ -172,7 +205,7 @@ def complaint(failed: Mapping[str, str], out: Path) -> str:
 
 
 def run_again(
-    cells: Mapping[str, Cell], name: str, out: Path, each: Each, lanes: int, tell: Told
+    cells: Mapping[str, Cell], name: str, out: Path, pools: Pools, tell: Told
 ) -> dict[str, Any]:
     """Do one cell anew, beside what it left before, and compare.
 
@@ -183,8 +216,7 @@ def run_again(
       cells: of the experiment.
       name: of the cell.
       out: folder of the experiment.
-      each: does several at once.
-      lanes: how many.
+      pools: of what does several at once.
       tell: told how many are done.
 
     Returns:
@@ -196,15 +228,16 @@ def run_again(
     if name not in cells:
         raise InputError(f"--cell {name}: there is none; {', '.join(list(cells)[:SHOWN])}, ...")
     needed = chosen(cells, [name])
-    failed = run_cells(needed, out, each, lanes, tell)
+    failed = run_cells(needed, out, pools, tell)
     if failed:
         raise InputError(complaint(failed, out))
     first = Order(cells[name], out.absolute())
     second = Order(cells[name], out.absolute(), AGAIN)
     if second.done:
         shutil.rmtree(second.folder)
-    with closing(each(work_on, [second])) as outcomes:
-        told = next(_settled(second, outcome) for _, outcome in outcomes)
+    with closing(pools(work_on)) as pool:
+        pool.begin(second)
+        told = _settled(*pool.settled())
     if told.error:
         raise InputError(f"{second.folder}: {told.error}")
     found = {str(o.folder): digest(o.result()) for o in (first, second)}

@@ -30,10 +30,10 @@ def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
     quiet()
     plan = plan_of(options)
     cells = graph(plan, options.policies, options.real)
-    with places.cases(options) as (each, lanes), counted("experiment") as tell:
+    with places.cases(options) as (pools, _), counted("experiment") as tell:
         if options.cell is not None:
-            return run_again(cells, options.cell, out, each, lanes, tell)
-        failed = run_cells(cells, out, each, lanes, tell)
+            return run_again(cells, options.cell, out, pools, tell)
+        failed = run_cells(cells, out, pools, tell)
     document = gather(plan, cells, failed, out.absolute())
     write_json(out / EXPERIMENT, document)
     write_report(document, out / REPORT)
