@@ -5,19 +5,15 @@ commands of this computer, emergency stop, trials, systemd.
 """
 
 import logging
-import os
 import queue
 import subprocess
 import threading
 import time
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from shutil import which
 from typing import Any
-
-import zmq
 
 from hardware_agent.activities import Event
 from hardware_agent.body import Body as RobotBody
@@ -27,7 +23,7 @@ from hardware_agent.control import ControlServer
 from hardware_agent.distance import distance_of
 from hardware_agent.health import health
 from hardware_agent.journal import Journal
-from hardware_agent.link import Link
+from hardware_agent.link_thread import LinkThread
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.port import BusError, BusyError
@@ -97,8 +93,12 @@ class Agent:
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._calls: queue.SimpleQueue[Call] = queue.SimpleQueue()
         self._stops = 0
-        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._link = Link(settings.link, self._hello) if settings.link.gateway else None
+        self._bell = threading.Event()
+        self._heard: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._met = threading.Event()  # the gateway, and it has not been told hello
+        self._link: LinkThread | None = None
+        if settings.link.gateway:
+            self._link = LinkThread(settings.link, self._meet, self._hear)
         self._control = ControlServer(settings.socket, self.answer)
         self._stopper: subprocess.Popen[bytes] | None = None
         self._ending = False
@@ -125,6 +125,8 @@ class Agent:
         )
         self._motion.start()
         self._control.start()
+        if self._link is not None:
+            self._link.start()
         log.info("ready: %s, torque is off", self._settings.name)
         notify("READY=1")
         try:
@@ -132,13 +134,15 @@ class Agent:
                 self._turn()
                 if not self._motion.is_alive():  # its error stands in the log
                     raise RuntimeError("the control loop has ended")
+                if self._link is not None and not self._link.is_alive():  # likewise
+                    raise RuntimeError("the link's thread has ended")
         finally:
             self._close()
 
     def end(self) -> None:
         """End the agent, from a signal or another thread."""
         self._ending = True
-        self._ring()
+        self._bell.set()
 
     def answer(self, command: dict[str, Any]) -> dict[str, Any]:
         """Do a command of this computer; called from other threads.
@@ -153,7 +157,7 @@ class Agent:
             return self.health()
         call = Call(command, self._stops)
         self._calls.put(call)
-        self._ring()
+        self._bell.set()
         try:
             return call.done.result(timeout=PATIENCE) or {}
         except TimeoutError as error:
@@ -191,12 +195,15 @@ class Agent:
 
     def _turn(self) -> None:
         """Sleep until something happens, and see to everything."""
-        self._sleep()
+        self._bell.wait(TURN)
+        self._bell.clear()
         while not self._calls.empty():
             self._answer(self._calls.get())
-        if self._link is not None:
-            for message in self._link.receive():
-                self._receive(message)
+        if self._met.is_set():
+            self._met.clear()
+            self._send(*self._hello())
+        while not self._heard.empty():
+            self._receive(self._heard.get())
         while not self._events.empty():
             self._conductor.handle(self._events.get())
         self._conductor.tend()
@@ -220,20 +227,22 @@ class Agent:
         self._stops += 1
         self._motion.stop(reason)
 
-    def _sleep(self) -> None:
-        poller = zmq.Poller()
-        poller.register(self._bell, zmq.POLLIN)
-        for socket in self._link.sockets if self._link else ():
-            poller.register(socket, zmq.POLLIN)
-        poller.poll(round(TURN * 1000))
-        with suppress(BlockingIOError):
-            os.eventfd_read(self._bell)
+    def _meet(self) -> None:
+        """A connection has come about; from the link's thread."""
+        self._met.set()
+        self._bell.set()
+
+    def _hear(self, message: Message) -> None:
+        """A message has come; from the link's thread. A stop is done there and then."""
+        if isinstance(message.body, Stop):
+            self._stop(f"gateway: {message.body.reason}")
+            return
+        self._heard.put(message)
+        self._bell.set()
 
     def _receive(self, message: Message) -> None:
         body = message.body
-        if isinstance(body, Stop):
-            self._stop(f"gateway: {body.reason}")
-        elif isinstance(body, Assign):
+        if isinstance(body, Assign):
             answers = self._book.assigned(body)
             if not answers:
                 log.warning("trial %s, attempt %d: not taken", body.trial, body.attempt)
@@ -305,7 +314,6 @@ class Agent:
             notify("WATCHDOG=1", f"STATUS={state} {self._motion.status.reason}")
         if self._link is None:
             return
-        self._link.tend()
         if now - self._beaten >= self._settings.link.heartbeat or changed:
             self._beaten = now
             told = self.health()
@@ -334,11 +342,7 @@ class Agent:
 
     def _happened(self, event: Event) -> None:
         self._events.put(event)
-        self._ring()
-
-    def _ring(self) -> None:
-        with suppress(BlockingIOError, OSError):
-            os.eventfd_write(self._bell, 1)
+        self._bell.set()
 
     def _close(self) -> None:
         """Limp, then silent."""

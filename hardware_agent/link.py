@@ -29,7 +29,7 @@ class Link:
 
     Args:
       settings: of the configuration.
-      hello: what is said first in every connection.
+      greet: called when a connection has come about.
 
     Raises:
       InputError: a key cannot be read.
@@ -38,14 +38,13 @@ class Link:
     def __init__(
         self,
         settings: LinkSettings,
-        hello: Callable[[], list[Body]],
+        greet: Callable[[], None],
     ) -> None:
         self._settings = settings
-        self._hello = hello
+        self._greet = greet
         self._context: zmq.Context[Any] = zmq.Context.instance()
         self._own = _key(settings.key, secret=True)
         self._gateway = _key(settings.gateway_key, secret=False)[0]
-        self._poller = zmq.Poller()
         self._socket: zmq.Socket[Any] | None = None
         self._monitor: zmq.Socket[Any] | None = None
         self._heard = self._opened = -1e9
@@ -68,8 +67,8 @@ class Link:
         Returns:
           Whether the sockets are others now.
         """
-        if self._greet():
-            self.send(*self._hello())
+        if self._come():
+            self._greet()
         now = time.monotonic()
         silence = now - max(self._heard, self._opened)
         if self._socket is not None and silence < self._pause:
@@ -119,7 +118,7 @@ class Link:
             self._socket.close(linger=linger)
             self._socket = self._monitor = None
 
-    def _greet(self) -> bool:
+    def _come(self) -> bool:
         """Whether a connection has come about, ours or one that ZeroMQ made again by itself."""
         come = False
         while self._monitor is not None:

@@ -17,7 +17,7 @@ from hardware_agent.rollout import recording_id
 from hardware_agent.senses import Senses
 from hardware_agent.status import LONGEST, Refused, brief
 from pup.errors import InputError
-from pup.wire import Armed, Assign, Finished, Outcome, RecordingChunk, Running
+from pup.wire import Armed, Assign, Finished, Outcome, RecordingChunk, Running, Stop
 
 pytest.importorskip("mujoco")
 
@@ -72,6 +72,21 @@ def test_what_was_asked_before_a_stop_is_not_done_after_it(tmp_path: Path) -> No
             asked = [pool.submit(made.say, "enable") for _ in range(2)]
             time.sleep(0.5)
             made.say("stop")
+            told = [str(one.exception(timeout=20)) for one in asked]
+        assert sorted("ask again" in words for words in told) == [False, True], told
+        plug_port(made)
+        time.sleep(0.5)
+        assert holding(made) == 0
+
+
+def test_a_stop_of_the_gateway_waits_for_nothing_that_was_asked(tmp_path: Path) -> None:
+    """Two `enable` wait; the stop comes by the link, which the agent's loop does not get to."""
+    with at_work(tmp_path, speed=1.0) as (made, gateway):
+        pull_port(made)
+        with ThreadPoolExecutor(2) as pool:
+            asked = [pool.submit(made.say, "enable") for _ in range(2)]
+            time.sleep(0.5)
+            gateway.send(Stop("somebody saw smoke"))
             told = [str(one.exception(timeout=20)) for one in asked]
         assert sorted("ask again" in words for words in told) == [False, True], told
         plug_port(made)

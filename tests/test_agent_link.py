@@ -11,24 +11,21 @@ from far_end import Gateway, keys
 from hardware_agent.config import LinkSettings
 from hardware_agent.link import Link
 from pup.errors import InputError
-from pup.wire import Acknowledge, Body, Heartbeat, Hello, Stop
-
-
-def hello() -> list[Body]:
-    return [Hello("tested", "darwin_op2", "1")]
+from pup.wire import Acknowledge, Heartbeat, Hello, Stop
 
 
 def link(gateway: Gateway, key: str = "agent") -> Link:
     folder = gateway.folder
-    return Link(
+    made = Link(
         LinkSettings(
             f"tcp://127.0.0.1:{gateway.port}",
             str(folder / f"{key}.key_secret"),
             str(folder / "gateway.key"),
             heartbeat=0.1,
         ),
-        hello,
+        lambda: made.send(Hello("tested", "darwin_op2", "1")),
     )
+    return made
 
 
 def tended(made: Link, happened: Callable[[], object], seconds: float = 10.0) -> bool:
@@ -107,7 +104,7 @@ def test_a_key_that_is_none_is_told(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"key"):
             Link(
                 LinkSettings("tcp://a:1", str(tmp_path / key), str(tmp_path / "gateway.key")),
-                hello,
+                lambda: None,
             )
 
 
@@ -121,7 +118,7 @@ def test_nothing_waits_for_a_gateway_that_is_not_there(tmp_path: Path) -> None:
             str(tmp_path / "agent.key_secret"),
             str(tmp_path / "gateway.key"),
         ),
-        hello,
+        lambda: None,
     )
     before = time.monotonic()
     for _ in range(200):
