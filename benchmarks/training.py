@@ -109,7 +109,8 @@ def _work(given: argparse.Namespace) -> Work:
     walking = Walking(robot, read_bounds(robot.identified_path, robot), TaskSettings())
     task = walking(1, 0, 1)
     names = task.observation_names, task.parameter_names
-    shape = PolicyShape.of(Method.PUP, *map(len, names), len(task.joints), task.bins)
+    sizes = map(len, (*names, task.privileged_names, task.joints))
+    shape = PolicyShape.of(Method.PUP, *sizes, task.bins)
     sampling = Sampling(walking, given.simulations, given.length, 0, given.threads)
     mirror = MirrorMap.of(robot, *names, bins=task.bins)
     return Work(walking, shape, sampling, Learning(mirror=mirror))

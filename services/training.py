@@ -166,6 +166,7 @@ class _Job:
             options.method,
             len(task.observation_names),
             len(task.parameter_names),
+            len(task.privileged_names),
             len(task.joints),
             task.bins,
         )
@@ -301,7 +302,8 @@ class _Job:
             "steps": card.provenance.get("steps"),
         }
         names, lower, upper = self.card.parameters, self.bounds.lower, self.bounds.upper
-        return dict(for_bounds(card, weights, names, lower, upper))
+        course = self.shape.privileged - len(names)
+        return dict(for_bounds(card, weights, names, lower, upper, course))
 
     def _card(self, task: WalkingTask) -> PolicyCard:
         robot, settings = self.robot, self.settings

@@ -88,7 +88,7 @@ def bundle(
     """
     gait = gait or DARWIN.gait
     assert gait is not None
-    shape = PolicyShape.of(method, len(OBSERVATION), len(parameters), len(DARWIN.joints))
+    shape = PolicyShape.of(method, len(OBSERVATION), *2 * [len(parameters)], len(DARWIN.joints))
     rng = np.random.default_rng(0)
     weights: dict[str, np.ndarray] = {
         "observations.count": np.array(1.0),

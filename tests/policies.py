@@ -17,7 +17,8 @@ OBSERVATION = (
 )
 PARAMETERS = ("rho/arm", "rho/knee", "torque_limit", "ground_friction")
 MIRROR = MirrorMap.of(ROBOT, OBSERVATION, PARAMETERS)
-SIZES = len(OBSERVATION), len(PARAMETERS), len(ROBOT.joints)
+COURSE = 2
+SIZES = len(OBSERVATION), len(PARAMETERS), COURSE + len(PARAMETERS), len(ROBOT.joints)
 
 
 def policy_of(method: Method = Method.PUP, seed: int = 0) -> ProjectedPolicy:

@@ -24,6 +24,7 @@ from pup.errors import InputError
 from pup.locomotion.reference import Reference
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.task import COURSE, PACE
 from pup.physics.actuators import NetworkPD
 from pup.robot import RobotDescription
 
@@ -295,3 +296,44 @@ def test_a_sampler_of_given_parameters_repeats_them() -> None:
         seen.true_parameters, np.repeat([[0], [1 / 3], [2 / 3], [1]], 14, axis=1), atol=1e-6
     )
     np.testing.assert_array_equal(seen.parameters, seen.true_parameters)
+
+
+@pytest.mark.parametrize("direction", list(Direction))
+def test_a_value_function_is_told_the_course(direction: Direction) -> None:
+    """Where and how fast, as the step tells it; how it leans and heads, as the robot is turned."""
+    task = walking(settings=replace(EXACT, direction=direction))
+    names = [name.removeprefix("course/") for name in task.privileged_names[: len(COURSE)]]
+    assert tuple(names) == COURSE and task.privileged_names[len(COURSE) :] == task.parameter_names
+    assert DARWIN.gait is not None
+    rng, first = np.random.default_rng(3), task.reset()
+    at_rest = np.array([0, 0, 0, 0.16 / DARWIN.gait.tilt_limit, 0, 0, 1, 0])
+    np.testing.assert_allclose(first.privileged[0, : len(COURSE)], at_rest, atol=1e-6)
+    last = np.zeros(4), np.zeros(4)
+    for _ in range(6):
+        step = task.step(random_actions(rng, 4))
+        told = dict(zip(task.privileged_names, step.observation.privileged.T, strict=True))
+        state = task.state()
+        period = state["episodes/period"]
+        ahead, aside = (
+            (now - then) / period / PACE
+            for now, then in zip((step.distance, step.aside), last, strict=True)
+        )
+        last = step.distance, step.aside
+        np.testing.assert_allclose(
+            told["course/aside"], step.aside / DARWIN.gait.drift_limit, atol=1e-6
+        )
+        np.testing.assert_allclose(told["course/speed/ahead"], ahead, atol=1e-4)
+        np.testing.assert_allclose(told["course/speed/aside"], aside, atol=1e-4)
+        np.testing.assert_allclose(
+            told["course/phase/x"] ** 2 + told["course/phase/y"] ** 2, 1, atol=1e-6
+        )
+        w, x, y, z = state["simulations/physics"][:, QPOS][:, 3:7].T
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+        np.testing.assert_allclose(told["course/heading"], heading, atol=1e-5)
+        tilt = step.observation.proprioception[:, -4:-2] / DARWIN.gait.tilt_limit
+        np.testing.assert_allclose(told["course/roll"], tilt[:, 0], atol=1e-5)
+    np.testing.assert_allclose(
+        step.observation.privileged[:, len(COURSE) :],
+        2 * step.observation.true_parameters - 1,
+        atol=1e-6,
+    )

@@ -52,11 +52,12 @@ def test_drawn_bins_have_the_probabilities_told() -> None:
 def test_values_keep_their_meaning_when_returns_are_learnt() -> None:
     """New statistics of returns do not change what the value function says in their units."""
     policy = policy_of()
-    seen, mu = (torch.from_numpy(a).float() for a in observations(50))
+    seen = torch.from_numpy(observations(50)[0]).float()
+    known = torch.randn(50, SIZES[2])
 
     def values() -> torch.Tensor:
         with torch.no_grad():
-            return policy.value(seen, mu) * policy.returns.scale + policy.returns.mean
+            return policy.value(seen, known) * policy.returns.scale + policy.returns.mean
 
     before = values()
     policy.learn_returns(torch.randn(4000) * 5 - 70)
@@ -90,7 +91,7 @@ def test_methods_see_what_they_should() -> None:
         assert policy.project(mu).shape == (20, eta)
         moved = not torch.equal(policy(seen, mu), policy(seen, 1 - mu))
         assert moved == (eta > 0)
-        assert policy.value(seen, mu).shape == (20,)
+        assert policy.value(seen, torch.randn(20, SIZES[2])).shape == (20,)
 
 
 # --- Symmetry -------------------------------------------------------------------------------------
@@ -107,7 +108,7 @@ def test_mirror_is_an_involution(seed: int) -> None:
     )
     logits = rng.normal(size=len(MIRROR.logits))
     np.testing.assert_array_equal(logits[MIRROR.logits][MIRROR.logits], logits)
-    bins = rng.integers(0, 11, SIZES[2])
+    bins = rng.integers(0, 11, SIZES[3])
     np.testing.assert_array_equal(MIRROR.bins(MIRROR.bins(bins)), bins)
 
 
@@ -138,8 +139,10 @@ def test_mirrored_bins_are_the_likeliest_of_mirrored_logits() -> None:
 def samples_of(policy: ProjectedPolicy, count: int = 64) -> Samples:
     seen, mu = (torch.from_numpy(a).float() for a in observations(count))
     with torch.no_grad():
-        bins, log = draw(policy(seen, mu), torch.rand(count, SIZES[2]))
-    return Samples(seen, mu, mu, bins, log, torch.randn(count), torch.randn(count))
+        bins, log = draw(policy(seen, mu), torch.rand(count, SIZES[3]))
+    return Samples(
+        seen, mu, torch.randn(count, SIZES[2]), bins, log, torch.randn(count), torch.randn(count)
+    )
 
 
 class Symmetric(ProjectedPolicy):

@@ -17,7 +17,7 @@ from pup.robot import RobotDescription
 
 torch = pytest.importorskip("torch")
 
-from policies import ROBOT, card_of, observations, policy_of, weights_of  # noqa: E402
+from policies import COURSE, ROBOT, card_of, observations, policy_of, weights_of  # noqa: E402
 
 from pup.policy.network import ProjectedPolicy, expected  # noqa: E402
 
@@ -60,19 +60,19 @@ def test_other_bounds_change_the_scale_and_not_the_policy(method: Method) -> Non
     card, rng = card_of(policy, method), np.random.default_rng(3)
     weights = weights_of(policy)
     own = np.array(card.parameter_lower), np.array(card.parameter_upper)
-    same = for_bounds(card, weights, card.parameters, *own)
+    same = for_bounds(card, weights, card.parameters, *own, COURSE)
     assert same.keys() == weights.keys()
     assert all(np.array_equal(same[name], weights[name]) for name in weights)
     lower, upper = np.array([0.2, 1.0, 0.7, 0.9]), np.array([1.1, 2.0, 0.8, 0.9])
     width = np.where(upper > lower, upper - lower, 1.0)
     moved = ProjectedPolicy(policy.shape)
-    other = for_bounds(card, weights, card.parameters, lower, upper)
+    other = for_bounds(card, weights, card.parameters, lower, upper, COURSE)
     moved.load_state_dict({k: torch.from_numpy(v) for k, v in other.items()})
     mu = rng.uniform(0.6, 1.4, (200, 4))
     seen = torch.from_numpy(observations(200)[0])
     before = torch.from_numpy(((mu - own[0]) / (own[1] - own[0])).astype(np.float32))
     after = torch.from_numpy(((mu - lower) / width).astype(np.float32))
-    same_to_the_policy = [lambda p, unit: p(seen, unit), lambda p, unit: p.value(seen, unit)]
+    same_to_the_policy = [lambda p, unit: p(seen, unit), lambda p, unit: p.value(seen, known(unit))]
     if method is Method.PUP:  # the eta of UP is mu on the scale of the bounds
         same_to_the_policy.append(lambda p, unit: p.project(unit))
     for told in same_to_the_policy:
@@ -89,16 +89,36 @@ def test_other_parameters_are_seen_later_and_lost_ones_no_more(method: Method) -
     own = {n: (a, b) for n, a, b in zip(*_bounds(card), strict=True)} | {"new": (3.0, 5.0)}
     lower, upper = np.array([own[name] for name in names]).T
     moved = ProjectedPolicy(policy.shape)
-    other = for_bounds(card, weights_of(policy), names, lower, upper)
+    other = for_bounds(card, weights_of(policy), names, lower, upper, COURSE)
     moved.load_state_dict({k: torch.from_numpy(v) for k, v in other.items()})
     unit = rng.uniform(0, 1, (200, 4)).astype(np.float32)
     unit[:, 1] = 0.5
     after = np.column_stack([unit[:, 2:], rng.uniform(0, 1, 200), unit[:, 0]]).astype(np.float32)
     seen = torch.from_numpy(observations(200)[0])
     before, after = torch.from_numpy(unit), torch.from_numpy(after)
-    for told in (lambda p, u: p(seen, u), lambda p, u: p.value(seen, u)):
+    for told in (lambda p, u: p(seen, u), lambda p, u: p.value(seen, known(u))):
         torch.testing.assert_close(told(policy, before), told(moved, after), rtol=1e-4, atol=2e-3)
     assert lost not in names
+
+
+def known(unit: torch.Tensor) -> torch.Tensor:
+    """What a value function sees besides: a course, and mu about 0."""
+    course = torch.linspace(-1, 1, len(unit))[:, None].repeat(1, COURSE)
+    return torch.cat([course, 2 * unit - 1], dim=1)
+
+
+def test_a_value_function_that_saw_no_course_goes_on_with_one() -> None:
+    """It tells the same values until it has learnt what the course means."""
+    shape = replace(policy_of().shape, privileged=4)
+    old = ProjectedPolicy(shape)
+    card = replace(card_of(policy_of()), shape=shape)
+    own = np.array(card.parameter_lower), np.array(card.parameter_upper)
+    told = for_bounds(card, weights_of(old), card.parameters, *own, COURSE)
+    new = ProjectedPolicy(policy_of().shape)
+    new.load_state_dict({k: torch.from_numpy(v) for k, v in told.items()})
+    seen, mu = (torch.from_numpy(a).float() for a in observations(50))
+    before, after = old.value(seen, 2 * mu - 1), new.value(seen, known(mu))
+    torch.testing.assert_close(before, after, rtol=1e-5, atol=1e-5)
 
 
 def _bounds(card: PolicyCard) -> tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...]]:

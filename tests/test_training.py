@@ -35,7 +35,7 @@ from workers.module import PolicyModule, load
 from workers.ppo import Setup, Trainer, learner_place
 from workers.rollouts import Sampler, Sampling, spaces
 
-SHAPE = PolicyShape.of(Method.PUP, 2, 2, 2)
+SHAPE = PolicyShape.of(Method.PUP, 2, 2, 2, 2)
 SAMPLING = Sampling(ToyTask, simulations=32, steps=32, seed=0, threads=1)
 LEARNING = Learning(epochs=4, minibatch=256, rate=1e-3, iterations=30)
 TOY = Setup(SHAPE, SAMPLING, LEARNING)
@@ -110,7 +110,7 @@ def test_samples_of_fragments() -> None:
     live = fragments[0].live
     np.testing.assert_array_equal(sampled[0].bins, fragments[0].bins[live])
     np.testing.assert_array_equal(sampled[0].proprioception, fragments[0].proprioception[:-1][live])
-    values = module().policy.value(sampled[0].proprioception, sampled[0].true_parameters)
+    values = module().policy.value(sampled[0].proprioception, sampled[0].privileged)
     told = (sampled[0].returns - sampled[0].advantages).numpy()
     np.testing.assert_allclose(told, values.detach().numpy(), atol=1e-4)
 

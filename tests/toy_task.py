@@ -12,7 +12,7 @@ LIMIT, EPISODE, DT = 2.0, 40, 0.1
 class Observation:
     proprioception: np.ndarray
     parameters: np.ndarray
-    true_parameters: np.ndarray
+    privileged: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class ToyTask:
     joints = ("left", "right")
     observation_names = ("x", "v")
     parameter_names = ("strength", "nothing")
+    privileged_names = parameter_names
 
     def __init__(self, n: int, seed: int, threads: int = 1) -> None:
         self.n, self.rng = n, np.random.default_rng(seed)
@@ -78,7 +79,7 @@ class ToyTask:
 
     def _told(self) -> Observation:
         mu = self.mu.astype(np.float32)
-        return Observation(self.x.astype(np.float32), mu, mu)
+        return Observation(self.x.astype(np.float32), mu, 2 * mu - 1)
 
     def state(self) -> dict[str, np.ndarray]:
         words = [int(w) for w in _words(self.rng.bit_generator.state["state"].values())]

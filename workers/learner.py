@@ -118,12 +118,12 @@ def prepared(module: PolicyModule, fragment: Fragment, learning: Learning) -> Sa
 
     states = [
         tensor(a).flatten(0, 1)
-        for a in (fragment.proprioception, fragment.parameters, fragment.true_parameters)
+        for a in (fragment.proprioception, fragment.parameters, fragment.privileged)
     ]
     with torch.no_grad():
         chunks = zip(states[0].split(CHUNK), states[2].split(CHUNK), strict=True)
         told = torch.cat(
-            [module.compute_values({Columns.OBS: o, "true_parameters": m}) for o, m in chunks]
+            [module.compute_values({Columns.OBS: o, "privileged": m}) for o, m in chunks]
         )
     values = told.cpu().numpy().reshape(-1, fragment.reward.shape[1])
     ahead = advantages(

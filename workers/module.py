@@ -39,7 +39,7 @@ class PolicyModule(TorchRLModule, ValueFunctionAPI):
     def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
         """Values in units of the returns, shape (n,)."""
         policy = self.policy
-        told = policy.value(batch[Columns.OBS], batch["true_parameters"])
+        told = policy.value(batch[Columns.OBS], batch["privileged"])
         return told * policy.returns.scale + policy.returns.mean
 
 

@@ -27,7 +27,7 @@ class Observation(Protocol):
 
     proprioception: Array
     parameters: Array
-    true_parameters: Array
+    privileged: Array
 
 
 class Step(Protocol):
@@ -110,7 +110,7 @@ class Fragment:
     Attributes:
       proprioception: before each step and after the last, shape (T + 1, N, n_entries).
       parameters: mu as given to the policy, shape (T + 1, N, n_parameters).
-      true_parameters: shape (T + 1, N, n_parameters).
+      privileged: shape (T + 1, N, n_privileged).
       bins: actions, shape (T, N, joints).
       log: logarithm of their probability, shape (T, N).
       reward: shape (T, N).
@@ -123,7 +123,7 @@ class Fragment:
 
     proprioception: Array
     parameters: Array
-    true_parameters: Array
+    privileged: Array
     bins: NDArray[np.int8]
     log: Array
     reward: Array
@@ -167,7 +167,7 @@ class Sampler:
         seed = np.random.SeedSequence((self.sampling.seed, 1 + self.index, self.fragments))
         noise = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
         shape = (steps, task.n)
-        names = ("proprioception", "parameters", "true_parameters")
+        names = ("proprioception", "parameters", "privileged")
         seen = {
             name: np.empty((steps + 1, *getattr(now, name).shape), dtype=np.float32)
             for name in names
@@ -215,7 +215,7 @@ class Sampler:
         told = {"fragments": np.array(self.fragments), "returns": self.returns.copy()}
         if self.now is not None:
             told |= {f"task/{name}": value for name, value in self.task.state().items()}
-            for name in ("proprioception", "parameters", "true_parameters"):
+            for name in ("proprioception", "parameters", "privileged"):
                 told[f"now/{name}"] = getattr(self.now, name)
         return told
 
@@ -235,7 +235,7 @@ class _Now:
 
     proprioception: Array
     parameters: Array
-    true_parameters: Array
+    privileged: Array
 
 
 class BatchRunner(EnvRunner, Checkpointable):

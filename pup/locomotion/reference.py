@@ -31,6 +31,11 @@ class Reference:
             self._waves[: len(series.a), joint] = series.a
             self._waves[most : most + len(series.b), joint] = series.b
 
+    def phase(self, time: Array) -> Array:
+        """Cosine and sine of where the gait is at times, (n,) s; shape (n, 2)."""
+        turn = 2 * np.pi / self.gait.period * np.maximum(time - self.gait.blend, 0.0)[:, None]
+        return np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
+
     def angles(self, time: Array) -> Array:
         """Angles at times since the start of an episode, (n,) s, shape (n, n_joints), rad."""
         into = np.maximum(time - self.gait.blend, 0.0)[:, None] * self._harmonics

@@ -30,6 +30,12 @@ def rotation(vector: Array) -> Array:
     return np.concatenate([np.cos(angle / 2), half * vector], axis=-1)
 
 
+def heading(quaternion: Array) -> Array:
+    """Yaw (Z-Y-X Euler angles), (...,), rad."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
 def roll_pitch(quaternion: Array) -> Array:
     """Roll and pitch (Z-Y-X Euler angles), (..., 2), rad."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)

@@ -49,8 +49,7 @@ def differentiated(
         off *= 2 * weights.mirror / (few * joints)
         slope[count:] = _by_logits(off, chance[count:])
         slope[:few] -= _by_logits(mirror.probabilities(off), chance[:few])
-    known = policy.privileged(samples.true_parameters)
-    judged = _forward(policy.critic, torch.cat([seen[:count], known], dim=-1))
+    judged = _forward(policy.critic, torch.cat([seen[:count], samples.privileged], dim=-1))
     error = judged[-1] - samples.returns[:, None]
     value = 0.5 * error.square().mean()
     _, critic = _backward(policy.critic, judged, error.mul_(weights.value / count))

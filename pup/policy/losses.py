@@ -41,7 +41,7 @@ class Samples(NamedTuple):
     Attributes:
       proprioception: shape (n, n_entries).
       parameters: mu as given to the policy, shape (n, n_parameters).
-      true_parameters: shape (n, n_parameters).
+      privileged: what the value function sees besides, shape (n, n_privileged).
       bins: actions, shape (n, joints).
       log: logarithm of the actions' probability when they were drawn, shape (n,).
       advantages: normalised, shape (n,).
@@ -50,7 +50,7 @@ class Samples(NamedTuple):
 
     proprioception: Tensor
     parameters: Tensor
-    true_parameters: Tensor
+    privileged: Tensor
     bins: Tensor
     log: Tensor
     advantages: Tensor
@@ -134,7 +134,7 @@ def losses(
     surrogate = -torch.minimum(ratio * samples.advantages, kept * samples.advantages).mean()
     with torch.set_grad_enabled(weights.entropy > 0 and torch.is_grad_enabled()):
         entropy = -(log.exp() * log).sum() / (count * policy.shape.joints)
-    error = policy.value(samples.proprioception, samples.true_parameters) - samples.returns
+    error = policy.value(samples.proprioception, samples.privileged) - samples.returns
     value = 0.5 * error.square().mean()
     total = surrogate + weights.value * value + weights.mirror * apart - weights.entropy * entropy
     with torch.no_grad():

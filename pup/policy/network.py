@@ -64,8 +64,9 @@ class Normaliser(torch.nn.Module):
 class ProjectedPolicy(torch.nn.Module):
     """A policy conditioned on eta, the projection of mu to it, and a value function.
 
-    The value function sees the true mu in place of eta: it is used in training alone, where mu is
-    known. Its values are in units of the standard deviation of returns.
+    The value function sees the true mu in place of eta, and the course that the robot is on: it is
+    used in training alone, where these are known. Its values are in units of the standard deviation
+    of returns.
 
     Args:
       shape: sizes.
@@ -99,10 +100,6 @@ class ProjectedPolicy(torch.nn.Module):
         centred = 2 * parameters - 1
         return centred if self.shape.latent else centred[..., : self.shape.eta]
 
-    def privileged(self, true_parameters: Tensor) -> Tensor:
-        """What the value function sees of mu, about 0."""
-        return 2 * true_parameters[..., : self.shape.privileged] - 1
-
     def logits(self, proprioception: Tensor, eta: Tensor) -> Tensor:
         """Logits of the bins, shape (n, bins, joints)."""
         flat = self.actor(torch.cat([self.observations(proprioception), eta], dim=-1))
@@ -112,10 +109,10 @@ class ProjectedPolicy(torch.nn.Module):
         """Logits by mu, shape (n, bins, joints)."""
         return self.logits(proprioception, self.project(parameters))
 
-    def value(self, proprioception: Tensor, true_parameters: Tensor) -> Tensor:
+    def value(self, proprioception: Tensor, privileged: Tensor) -> Tensor:
         """Values in units of the returns' standard deviation from their mean, shape (n,)."""
-        known = self.privileged(true_parameters)
-        return self.critic(torch.cat([self.observations(proprioception), known], dim=-1))[..., 0]
+        known = self.observations(proprioception), privileged
+        return self.critic(torch.cat(known, dim=-1))[..., 0]
 
     @torch.no_grad()
     def sharpen(self, factor: float) -> None:

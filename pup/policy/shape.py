@@ -33,7 +33,8 @@ class PolicyShape:
     Attributes:
       proprioception: entries of an observation.
       parameters: entries of mu that the policy is given; 0 where it sees none.
-      privileged: entries of the true mu that the value function sees; training alone uses it.
+      privileged: entries of what the value function sees besides: the course that the robot is
+        on, then the true mu; training alone uses it.
       joints: actuated joints.
       latent: dimensions of eta that mu is projected to; 0 without a projection.
       bins: values an action may take at a joint.
@@ -52,7 +53,13 @@ class PolicyShape:
 
     @classmethod
     def of(
-        cls, method: Method, proprioception: int, parameters: int, joints: int, bins: int = BINS
+        cls,
+        method: Method,
+        proprioception: int,
+        parameters: int,
+        privileged: int,
+        joints: int,
+        bins: int = BINS,
     ) -> "PolicyShape":
         """The shape for a method.
 
@@ -60,12 +67,13 @@ class PolicyShape:
           method: see Method.
           proprioception: entries of an observation.
           parameters: entries of mu.
+          privileged: entries of what the value function sees besides.
           joints: actuated joints.
           bins: values an action may take at a joint.
         """
         seen = parameters if method in (Method.PUP, Method.UP) else 0
         latent = LATENT if method == Method.PUP else 0
-        return cls(proprioception, seen, parameters, joints, latent, bins)
+        return cls(proprioception, seen, privileged, joints, latent, bins)
 
     @property
     def eta(self) -> int:
