@@ -60,6 +60,8 @@ def test_a_start_that_is_read_with_noise_widens_them() -> None:
 
 SHARP = np.array([[40.0, 10.0, 0.0], [10.0, 20.0, 0.0], [0.0, 0.0, 0.0]])
 """Curvature of a loss that its third parameter does nothing to."""
+SCATTER = 0.02
+"""Of the recordings' minima, in each direction."""
 NOTHING = Slopes(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)))
 
 
@@ -68,7 +70,7 @@ def rippled(rng: np.random.Generator, recordings: int = 10) -> tuple[Shares, Arr
 
     Each recording has its own minimum, scattered about the middle, and ripples of a hundredth.
     """
-    minima = 0.5 + 0.02 * rng.normal(size=(recordings, 3))
+    minima = 0.5 + SCATTER * rng.normal(size=(recordings, 3))
     wave = rng.normal(size=(recordings, 2)) * 400
     phase = rng.uniform(0, 2 * np.pi, recordings)
 
@@ -81,20 +83,33 @@ def rippled(rng: np.random.Generator, recordings: int = 10) -> tuple[Shares, Arr
     return shares, tried[np.argmin(shares(tried).mean(axis=1))]
 
 
-def test_ripples_hide_no_parameter_and_sharpen_none() -> None:
-    """Nine intervals in ten hold the truth, and what the loss does not depend on stays unknown."""
+def intervals(recordings: int, draws: int, noise: Array) -> tuple[Array, Array]:
+    """How often 90 % intervals hold the truth, and their median width, for three parameters."""
     rng = np.random.default_rng(2)
     space = ParameterSpace(("a", "b", "c"), ("1",) * 3, np.full(3, 0.5), np.zeros(3), np.ones(3))
     inside, wide = [], []
-    for _ in range(60):
-        shares, unit = rippled(rng)
+    for _ in range(draws):
+        shares, unit = rippled(rng, recordings)
         start = np.diag([1e-6, 1e-6, 1 / 12])  # a ripple's slopes claim a thousandth
         ground = surface(shares, unit, start, NOTHING.curvature, 0.03)
-        told = over_ripples(space, unit, NOTHING, ground).confidence(0.9)
+        told = over_ripples(space, unit, NOTHING, ground, noise).confidence(0.9)
         inside.append((told.lower <= 0.5) & (told.upper >= 0.5))
         wide.append(told.upper - told.lower)
-    held, width = np.mean(inside, axis=0), np.median(wide, axis=0)
+    return np.mean(inside, axis=0), np.median(wide, axis=0)
+
+
+def test_ripples_hide_no_parameter_and_sharpen_none() -> None:
+    """Nine intervals in ten hold the truth, and what the loss does not depend on stays unknown."""
+    held, width = intervals(10, 60, NOTHING.scatter)
     assert (held[:2] > 0.8).all()
     assert (held[:2] < 0.99).all()
     assert (width[:2] < 0.08).all()
+    assert width[2] > 0.85
+
+
+def test_a_single_recording_is_as_uncertain_as_its_readings_make_it() -> None:
+    """It has no others to differ from, and that is no certainty."""
+    held, width = intervals(1, 60, SCATTER**2 * SHARP @ SHARP)
+    assert (held[:2] > 0.7).all()
+    assert (held[:2] < 0.99).all()
     assert width[2] > 0.85

@@ -23,6 +23,8 @@ RISE = 0.03
 """Share by which equation 1 rises on average where a surface is fitted to it."""
 FARTHEST = 2.0
 """Standard deviations of a surface's draws that its minimum may lie away."""
+KNOWN = 1e-3
+"""Share of a variance that is estimated, below which it is as good as known."""
 UNSEEN = 0.9
 """Share of the prior's spread left, above which the interval is the whole search range."""
 
@@ -107,7 +109,8 @@ def spread_at(
         rise = RISE * float(problem.losses(unit[None])[0])
         shares = _shares(problem, on_ground, progress)
         ground = surface(shares, unit, covariance, hanging.curvature, rise)
-        return over_ripples(problem.free_space, unit, hanging, ground)
+        noise = slopes(told.of(on_ground), starts).scatter
+        return over_ripples(problem.free_space, unit, hanging, ground, noise)
 
 
 def _shares(
@@ -128,7 +131,9 @@ def _shares(
     return shares
 
 
-def over_ripples(space: ParameterSpace, unit: Array, hanging: Slopes, ground: Surface) -> Spread:
+def over_ripples(
+    space: ParameterSpace, unit: Array, hanging: Slopes, ground: Surface, noise: Array
+) -> Spread:
     """Where the minimum of equation 1 is, and how it would scatter with other recordings.
 
     Args:
@@ -136,6 +141,8 @@ def over_ripples(space: ParameterSpace, unit: Array, hanging: Slopes, ground: Su
       unit: where the slopes and the surface were taken, on the unit cube, shape (k,).
       hanging: of the recordings in the air.
       ground: of those with contact.
+      noise: covariance of the slopes of those by their readings, shape (k, k). It stands in where
+        there is a single one, which cannot tell how another would differ.
     """
     count = len(ground.slopes)
     mean = ground.slopes.mean(axis=0)
@@ -143,21 +150,31 @@ def over_ripples(space: ParameterSpace, unit: Array, hanging: Slopes, ground: Su
     both = Slopes(
         hanging.gradient + mean,
         hanging.curvature + ground.curvature,
-        hanging.scatter + ground.slope_error + off.T @ off,
+        hanging.scatter + ground.slope_error + (off.T @ off if count > 1 else noise),
     )
     inverse = np.linalg.inv(hanging.curvature + ground.at_least)
     step = -inverse @ both.gradient
     far = float(np.sqrt(step @ np.linalg.solve(ground.draws, step)))
-    # After Welch and Satterthwaite: only the scatter over recordings is an estimate, and a normal
-    # variable's fourth moment is three times its variance's square.
-    squares = (off @ inverse) ** 2
-    speaking = 3 * squares.sum(axis=0) ** 2 / np.maximum((squares**2).sum(axis=0), 1e-300) - 1
-    speaking = np.clip(speaking, 1.0, max(count - 1, 1))
     variance = np.diag(inverse @ both.scatter @ inverse)
-    freedom = speaking * (variance / np.maximum(squares.sum(axis=0), 1e-300)) ** 2
     return Spread(
         space,
         unit + step * min(1.0, FARTHEST / max(far, 1e-300)),
         np.asarray(np.linalg.inv(both.information + UNIFORM * np.eye(len(unit)))),
-        freedom,
+        _freedom((off @ inverse) ** 2, variance),
     )
+
+
+def _freedom(squares: Array, variance: Array) -> Array:
+    """Degrees of freedom of variances, after Welch and Satterthwaite.
+
+    Only the scatter over recordings is an estimate, and a normal variable's fourth moment is three
+    times its variance's square.
+
+    Args:
+      squares: what each recording adds to the variances, shape (n_recordings, k).
+      variance: with all that is known, shape (k,).
+    """
+    estimated = squares.sum(axis=0)
+    speaking = 3 * estimated**2 / np.maximum((squares**2).sum(axis=0), 1e-300) - 1
+    speaking = np.clip(speaking, 1.0, max(len(squares) - 1, 1))
+    return np.asarray(speaking / np.maximum(estimated / variance, KNOWN) ** 2)
