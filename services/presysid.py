@@ -155,18 +155,18 @@ class _Job:
     def run(self) -> Bounds:
         begin = time.time()
         full = {a: self._problem(a) for a in self.actuators}
-        fitted = self._nominal(full)
+        fitted, held_out = self._nominal(full)
         main = full[self.options.actuator]
-        best = main.values(fitted["nominal", self.options.actuator].best[None])[0]
+        best = main.values(fitted[self.options.actuator].best[None])[0]
         bounded = replace(
             main,
             space=main.space.at(dict(zip(main.space.names, best, strict=True))),
             free=tuple(n for n in _movable(main.space) if n not in NETWORK_NAMES),
         )
         subsets = self._subsets(bounded)
-        bounds = self._bounds(bounded, fitted, full, subsets, begin)
+        bounds = self._bounds(bounded, fitted, full, held_out, subsets, begin)
         bounds.write(self.out / "bounds.json")
-        replays = {a: p.replay(fitted["nominal", a].best[None]) for a, p in full.items()}
+        replays = {a: p.replay(fitted[a].best[None]) for a, p in full.items()}
         labels = {"nn_pd": "NN-PD", "pd": "PD"}
         write_report(
             self.out / "report.html",
@@ -185,21 +185,26 @@ class _Job:
         free = tuple(
             n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
         )
-        problem = Problem(self.robot, self.recordings, actuator, space, free, self.threads)
-        start = problem.free_space.normalise(problem.free_space.nominal)
-        return replace(problem, free=observable(problem, start))
+        return _seen(Problem(self.robot, self.recordings, actuator, space, free, self.threads))
 
-    def _nominal(self, full: dict[Actuator, Problem]) -> dict[tuple[str, Actuator], FitResult]:
-        """The nominal fit and the folds' fits of each torque law."""
+    def _nominal(
+        self, full: dict[Actuator, Problem]
+    ) -> tuple[dict[Actuator, FitResult], dict[str, float] | None]:
+        """The nominal fit of each torque law, and the held-out error if there are folds."""
         if self.options.as_described:
-            return {("nominal", a): _described(problem) for a, problem in full.items()}
-        fits: dict[tuple[str, Actuator], Fit] = {}
-        for actuator, problem in full.items():
-            fits["nominal", actuator] = self._fit_of_all(f"nominal_{actuator}", problem)
-            for k, kept in enumerate(self._folds()):
-                name = f"fold{k}of{self.options.folds}_{actuator}"
-                fits[f"fold{k}", actuator] = self._fit_of_all(name, problem.of(kept))
-        return dict(zip(fits, self._fit("nominal fits", list(fits.values())), strict=True))
+            return {actuator: _described(problem) for actuator, problem in full.items()}, None
+        kept = self._folds()
+        nominal = {a: self._fit_of_all(f"nominal_{a}", p) for a, p in full.items()}
+        folds = {
+            (a, k): self._fit_of_all(f"fold{k}of{len(kept)}_{a}", _seen(p.of(chosen)))
+            for a, p in full.items()
+            for k, chosen in enumerate(kept)
+        }
+        results = self._fit("nominal fits", [*nominal.values(), *folds.values()])
+        fitted = dict(zip(nominal, results[: len(nominal)], strict=True))
+        told = zip(folds.items(), results[len(nominal) :], strict=True)
+        held_out = {key: (fit.problem, result) for (key, fit), result in told}
+        return fitted, self._held_out(held_out) if kept else None
 
     def _fit_of_all(self, name: str, problem: Problem) -> Fit:
         o = self.options
@@ -223,12 +228,10 @@ class _Job:
     def _subsets(self, bounded: Problem) -> tuple[SubsetFit, ...]:
         """Algorithm 1's fits, each over the bounded parameters that its recordings can see."""
         o = self.options
-        nominal = bounded.free_space.normalise(bounded.free_space.nominal)
         fits = []
         drawn = draw_subsets(len(self.recordings), o.subsets, o.fraction, o.seed)
         for i, subset in enumerate(drawn):
-            problem = bounded.of(subset)
-            problem = replace(problem, free=observable(problem, nominal))
+            problem = _seen(bounded.of(subset))
             at = problem.free_space.normalise(problem.free_space.nominal)
             settings = FitSettings(
                 at, NEAR_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
@@ -250,8 +253,9 @@ class _Job:
     def _bounds(
         self,
         bounded: Problem,
-        fitted: dict[tuple[str, Actuator], FitResult],
+        fitted: dict[Actuator, FitResult],
         full: dict[Actuator, Problem],
+        held_out: dict[str, float] | None,
         subsets: tuple[SubsetFit, ...],
         begin: float,
     ) -> Bounds:
@@ -266,7 +270,7 @@ class _Job:
         lower = np.where(spread.unseen, space.lower, lower)
         upper = np.where(spread.unseen, space.upper, upper)
         actuator = self.options.actuator
-        main, nominal = full[actuator], fitted["nominal", actuator]
+        main, nominal = full[actuator], fitted[actuator]
         phi = [n for n in bounded.space.names if n in NETWORK_NAMES]
         return Bounds(
             robot=self.robot.name,
@@ -280,10 +284,10 @@ class _Job:
             correlation=known.correlation,
             weights=bounded.space.select(phi).nominal,
             train=_measured(main, nominal),
-            held_out=self._held_out(full, fitted),
+            held_out=held_out,
             subsets=subsets,
             splits=self._splits(values, space, subsets),
-            histories={a: fitted["nominal", a].history for a in full},
+            histories={a: fitted[a].history for a in full},
             omitted=tuple(main.loss.omitted()),
             provenance=self._provenance(time.time() - begin),
         )
@@ -301,22 +305,18 @@ class _Job:
         return tuple(contact_splits(values, space, members, ground, self.options.seed))
 
     def _held_out(
-        self,
-        full: dict[Actuator, Problem],
-        fitted: dict[tuple[str, Actuator], FitResult],
-    ) -> dict[str, float] | None:
+        self, folds: dict[tuple[Actuator, int], tuple[Problem, FitResult]]
+    ) -> dict[str, float]:
         """Pooled loss and root mean square error of the recordings that each fold left out."""
-        if not self.options.folds:
-            return None
         measures: dict[str, float] = {}
-        everything = set(range(len(self.recordings)))
-        for actuator, problem in full.items():
+        for actuator in self.actuators:
             errors, losses = [], []
             for k, kept in enumerate(self._folds()):
-                left = problem.of(sorted(everything - set(kept)))
-                best = fitted[f"fold{k}", actuator].best[None]
-                errors.append(left.loss.rmse(left.replay(best))[0])
-                losses.append(left.losses(best)[0])
+                problem, result = folds[actuator, k]
+                left = tuple(r for i, r in enumerate(self.recordings) if i not in kept)
+                problem, best = replace(problem, recordings=left), result.best[None]
+                errors.append(problem.loss.rmse(problem.replay(best))[0])
+                losses.append(problem.losses(best)[0])
             suffix = "" if actuator == self.options.actuator else f"_{actuator}"
             measures["loss" + suffix] = float(np.mean(losses))
             measures["rmse" + suffix] = _pooled(np.concatenate(errors))
@@ -336,6 +336,12 @@ class _Job:
 def _movable(space: ParameterSpace) -> list[str]:
     """The parameters of the nominal model; the description's terms stay as they are."""
     return [name for name in space.names if split_column(name) is None]
+
+
+def _seen(problem: Problem) -> Problem:
+    """The same with those of its parameters free that its recordings can see."""
+    start = problem.free_space.normalise(problem.free_space.nominal)
+    return replace(problem, free=observable(problem, start))
 
 
 def _described(problem: Problem) -> FitResult:

@@ -1,0 +1,72 @@
+"""Pre-sysID's fits: which are made, of what, and what is asked of each."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from biped import biped
+from recordings import make
+
+from pup.recording import Recording
+from pup.robot import RobotDescription
+from pup.sysid.fit import FitResult
+from services.presysid import Options, _Job
+from workers.fits import Fit, Progress
+
+TICKS = 10
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    return biped(tmp_path_factory.mktemp("biped"))
+
+
+def stepped(id_: str, support: str, **changes: object) -> Recording:
+    """A step of both legs, which follow halfway."""
+    target = np.zeros((TICKS, 2))
+    target[2:] = [0.1, -0.1]
+    told = {
+        "id": id_,
+        "robot": "biped",
+        "motion": "stand" if support == "ground" else "step",
+        "support": support,
+        "joints": ("l_hip", "r_hip"),
+        "time": np.arange(TICKS) / 30,
+        "target": target,
+        "position": target / 2,
+    }
+    return make(**(told | changes))
+
+
+class Idle:
+    """A runner whose fits end where they begin."""
+
+    def __init__(self) -> None:
+        self.fits: dict[str, Fit] = {}
+
+    def run(self, fits: Sequence[Fit], checkpoints: Path, progress: Progress) -> list[FitResult]:
+        self.fits |= {fit.name: fit for fit in fits}
+        return [FitResult(fit.settings.start, 0.0, np.empty(0)) for fit in fits]
+
+
+def job_of(
+    robot: RobotDescription, recordings: tuple[Recording, ...], out: Path, options: Options
+) -> tuple[_Job, Idle]:
+    runner = Idle()
+    return _Job(robot, recordings, options, out, runner, lambda *_: None, 1), runner
+
+
+def test_a_fold_fits_what_its_recordings_can_see(robot: RobotDescription, tmp_path: Path) -> None:
+    """Those in the air know no friction of the ground, which the fold then leaves as it was."""
+    recordings = (stepped("air", "suspended"), stepped("floor", "ground"))
+    options = Options("pd", folds=2, compare=False)
+    job, runner = job_of(robot, recordings, tmp_path, options)
+    _, held_out = job._nominal({"pd": job._problem("pd")})
+    assert "ground_friction" in runner.fits["nominal_pd"].problem.free
+    folds = [fit.problem for name, fit in runner.fits.items() if name.startswith("fold")]
+    for problem in folds:
+        on_ground = problem.recordings[0].support == "ground"
+        assert ("ground_friction" in problem.free) is on_ground
+    assert held_out is not None and held_out["folds"] == 2
+    assert np.isfinite([held_out["loss"], held_out["rmse"]]).all()
