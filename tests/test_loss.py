@@ -127,6 +127,26 @@ def test_a_lean_at_rest_is_no_error_of_what_follows(lost: bool) -> None:
     assert told == pytest.approx(expected)
 
 
+def test_a_tick_without_tilt_does_not_hide_a_lean_at_rest() -> None:
+    """What is known of the rest tells the lean; where nothing is known of it, nothing is said."""
+    target = np.zeros((10, 2))
+    target[8:] = 0.5
+    measured = np.tile([0.04, -0.02], (10, 1))
+    measured[5, 0] = measured[4:8, 1] = NAN
+    stand = recorded(
+        "stand",
+        np.zeros((10, 2)),
+        measured,
+        motion="standup",
+        support="ground",
+        target=target,
+        time=np.arange(10) / 30,
+    )
+    seen = replayed((stand,), tilt=np.zeros((10, 2)))
+    unknown_lean = 0.02 * 6  # of the pitch, at the ticks that have one
+    assert loss_of(stand).terms(seen).tilt[0, 0] == pytest.approx(unknown_lean)
+
+
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_what_stands_before_a_recording_does_not_matter(order: tuple[int, int]) -> None:
     """Feet that a suspended recording does not have are no step of the next one's."""

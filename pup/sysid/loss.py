@@ -167,7 +167,7 @@ class ReplayLoss:
         away = (away + np.pi) % (2 * np.pi) - np.pi
         for part, rest in zip(self.ticks, self.rests, strict=True):
             if rest is not None:
-                away[:, part] -= np.nan_to_num(away[:, rest].mean(axis=1, keepdims=True))
+                away[:, part] -= _known_mean(away[:, rest])
         return np.where(np.isnan(away) & ~np.isnan(self.tilt), LOST_POSITION, away)
 
     def _feet_error(self, trajectories: Trajectories) -> Array:
@@ -214,6 +214,12 @@ def _difference(simulated: Array, measured: Array, lost: float) -> Array:
 def _length(error: Array) -> Array:
     """Euclidean norm over the last axis; what was not measured counts zero."""
     return np.asarray(np.sqrt(np.nansum(error**2, axis=-1)))
+
+
+def _known_mean(values: Array) -> Array:
+    """Mean over the ticks (n, n_ticks, k) that are known, shape (n, 1, k); 0 where none is."""
+    known = (~np.isnan(values)).sum(axis=1, keepdims=True)
+    return np.asarray(np.nansum(values, axis=1, keepdims=True) / np.maximum(known, 1))
 
 
 def _mean(values: Array) -> Array:

@@ -18,7 +18,7 @@ from pup.sysid.loss import ReplayLoss
 
 Array = NDArray[np.float64]
 
-MODEL = 7
+MODEL = 8
 """Raised with every change of the physics or the loss, which makes old checkpoints another's."""
 _VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "nevergrad", "cma")))
 
