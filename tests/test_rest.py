@@ -83,6 +83,21 @@ def test_readings_that_are_missing_are_left_out() -> None:
     np.testing.assert_allclose(start, [np.nanmean(known), 0.0])
 
 
+def test_a_gap_hides_no_drift() -> None:
+    """Every joint has one, and both sink: what is known tells."""
+    recording = resting("ground")
+    position = recording.position - 0.05 * np.linspace(0, 1, TICKS)[:, None]
+    position[2, 0] = position[3, 1] = np.nan
+    assert ticks_at_rest(replace(recording, position=position)) == 1
+
+
+def test_where_little_is_known_of_a_rest_there_is_none() -> None:
+    recording = resting("ground")
+    position = recording.position.copy()
+    position[1:] = np.nan
+    assert ticks_at_rest(replace(recording, position=position)) == 1
+
+
 def test_the_torso_is_as_its_imu_says_on_average() -> None:
     robot = RobotDescription.load("darwin_op2")
     model = compile_model(robot, "ground")

@@ -38,8 +38,8 @@ def ticks_at_rest(recording: Recording) -> int:
     asked = moved.any(axis=1)
     still = int(np.argmax(asked)) + 1 if asked.any() else len(recording.time)
     readings = np.column_stack([recording.position, *_tilts(recording)])[:still]
-    readings = readings[:, ~np.isnan(readings).any(axis=0)]
-    if still < FEWEST or _drifts(readings):
+    judged = [column for column in readings.T if _tells(column)]
+    if not judged or any(_drifts(column) for column in judged):
         return 1
     return still
 
@@ -55,11 +55,16 @@ def _tilts(recording: Recording) -> list[Array]:
     return [v for n in ("imu/roll", "imu/pitch") if (v := recording.extras.get(n)) is not None]
 
 
+def _tells(readings: Array) -> bool:
+    """Whether enough is known of both halves of a rest (n_ticks,) to compare them."""
+    return all((~np.isnan(half)).sum() >= FEWEST // 2 for half in np.array_split(readings, 2))
+
+
 def _drifts(readings: Array) -> bool:
-    """Whether the two halves of a rest (n_ticks, n) differ."""
-    before, after = np.array_split(readings, 2)
+    """Whether what is known of the two halves of a rest (n_ticks,) differs."""
+    before, after = (half[~np.isnan(half)] for half in np.array_split(readings, 2))
     # Of what jumps from reading to reading, whichever way they drift.
-    noise = np.median(np.abs(np.diff(readings, axis=0)), axis=0) / MEDIAN_OF_DIFFERENCES
+    jumps = np.diff(np.concatenate([before, after]))
+    noise = np.median(np.abs(jumps)) / MEDIAN_OF_DIFFERENCES
     error = noise * np.sqrt(1 / len(before) + 1 / len(after))
-    away = np.abs(after.mean(axis=0) - before.mean(axis=0))
-    return bool((away > DRIFT + CHANCE * error).any())
+    return bool(abs(after.mean() - before.mean()) > DRIFT + CHANCE * error)
