@@ -64,7 +64,10 @@ def test_the_least_point_is_the_same_without_its_covariance(anchored: bool) -> N
     anchor = np.full(4, 0.2) if anchored else None
     prior = {"prior_mean": anchor, "prior_sd": np.full(4, 0.3)} if anchored else {}
     whole = least_squares(problem, start, iterations=8, step=0.002, **prior)
-    point = least_point(problem, start, anchor, 0.3, iterations=8, step=0.002)
+    point, value = least_point(
+        problem, np.ones(40), start, problem(start[None])[0], anchor, 0.3, iterations=8, step=0.002
+    )
+    np.testing.assert_allclose(value, problem(point[None])[0], atol=1e-9)
     np.testing.assert_allclose(point, whole.best, atol=1e-3)
 
 
@@ -75,7 +78,10 @@ def test_updated_jacobians_lead_further_than_the_one_they_are_made_of() -> None:
     shares = []
     for seed in range(6):
         start = np.clip(truth + np.random.default_rng(seed).uniform(-0.1, 0.1, 6), 0, 1)
-        left = residuals(least_point(residuals, start, None, 1.0, iterations=1, step=1e-3)[None])[0]
+        value = residuals(start[None])[0]
+        _, left = least_point(
+            residuals, np.ones(150), start, value, None, 1.0, iterations=1, step=1e-3
+        )
         once = least_squares(residuals, start, iterations=1, step=1e-3)
         shares.append(left @ left / 2 / once.cost)
     assert max(shares) <= 1.0

@@ -2,7 +2,7 @@
 
 One iteration is two batches: the Jacobian's columns are candidates of one replay, and so are the
 trial steps, tried at many dampings at once. That is what makes it the quick fitter: the number of
-replays does not grow with the number of parameters.
+batches does not grow with the number of parameters.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from pup.physics.parameters import ParameterSpace
 
 Array = NDArray[np.float64]
 Residuals = Callable[[Array], Array]
-"""Candidates (n, n_parameters) on the unit cube to weighted residuals (n, n_residuals)."""
+"""Candidates (n, n_parameters) on the unit cube to residuals (n, n_residuals)."""
 
 STEPS = (1e-4, 1e-3, 1e-2)
 """Finite-difference steps on the unit cube, the next one when the one before leads no further.
@@ -102,39 +102,49 @@ def least_squares(
       tolerance: relative improvement of the cost below which it stops.
       step: of the finite differences on the unit cube; without one, those of STEPS in turn.
     """
-    prior = _Prior(start, prior_mean, prior_sd)
+    total = _Sum(residuals, 1.0, start, prior_mean, prior_sd)
     steps = STEPS if step is None else (step,)
-    reached = _descend(residuals, np.clip(start, 0.0, 1.0), prior, iterations, tolerance, steps)
+    begin = np.clip(start, 0.0, 1.0)
+    reached = _descend(total, begin, residuals(begin[None])[0], iterations, tolerance, steps)
     at, value = reached.at, reached.value
     jacobian = differences(residuals, at, value, CURVATURE_STEP if step is None else step)
     freedom = max(1, len(value) - len(at))
     noise = float(np.sqrt(value @ value / freedom))
-    covariance = _covariance(jacobian, noise, prior)
-    replays = reached.replays + len(at)
+    covariance = _covariance(jacobian, noise, total)
+    replays = 1 + reached.replays + len(at)
     return LeastSquares(at, reached.cost, reached.converged, replays, covariance, noise)
 
 
 def least_point(
     residuals: Residuals,
+    weight: Array,
     start: Array,
+    value: Array,
     anchor: Array | None,
     sd: float,
     iterations: int,
     step: float,
-) -> Array:
+) -> tuple[Array, Array]:
     """Where the sum of squared residuals is least, without what `least_squares` tells besides.
 
     Args:
-      residuals: as there.
-      start: likewise.
+      residuals: of a batch of candidates, without their weights; must not be NaN.
+      weight: of each residual, shape (n_residuals,).
+      start: shape (n_parameters,), within the unit cube.
+      value: the residuals there, shape (n_residuals,).
       anchor: centre of the prior, or None for no prior.
       sd: its standard deviation, the same for all parameters.
       iterations: at most this many Jacobians.
       step: of the finite differences on the unit cube.
+
+    Returns:
+      The point and its residuals, without their weights.
     """
-    prior = _Prior(start, anchor, None if anchor is None else np.full(len(start), sd))
-    begin = np.clip(start, 0.0, 1.0)
-    return _descend(residuals, begin, prior, iterations, TOLERANCE, (step,), UPDATES).at
+    total = _Sum(
+        residuals, weight, start, anchor, None if anchor is None else np.full(len(start), sd)
+    )
+    reached = _descend(total, start, value, iterations, TOLERANCE, (step,), UPDATES)
+    return reached.at, reached.value
 
 
 @dataclass(frozen=True)
@@ -149,44 +159,44 @@ class _Reached:
 
 
 def _descend(
-    residuals: Residuals,
+    total: "_Sum",
     at: Array,
-    prior: "_Prior",
+    value: Array,
     iterations: int,
     tolerance: float,
     steps: Sequence[float],
     updates: int = 0,
 ) -> _Reached:
-    """Levenberg-Marquardt from a point within the cube."""
-    value = residuals(at[None])[0]
-    cost = prior.cost(value, at)
-    replays, width, damping = 1, 0, FIRST_DAMPING
+    """Levenberg-Marquardt from a point within the cube and its residuals."""
+    cost = total.cost(value, at)
+    replays, width, damping = 0, 0, FIRST_DAMPING
     for _ in range(iterations):
-        jacobian = differences(residuals, at, value, steps[width])
+        jacobian = total.jacobian(at, value, steps[width])
         replays += len(at)
         enough = cost - tolerance * cost
         for factors in (DAMPINGS, HEAVIER * DAMPINGS):
-            trials = _trial_steps(jacobian, value, at, damping * factors, prior)
-            values, costs = _tried(residuals, trials, prior)
+            trials = _trial_steps(jacobian, value, at, damping * factors, total)
+            values, costs = total.tried(trials)
             replays += len(trials)
             pick = int(np.argmin(costs))
             if costs[pick] < enough:
                 break
         else:
-            parts = _component_steps(jacobian, value, at, prior)
-            trials, values, costs = _best_parts(residuals, parts, at, cost, prior)
+            parts = _component_steps(jacobian, value, at, total)
+            trials, values, costs = _best_parts(parts, at, cost, total)
             replays += len(trials)
             pick, factors = int(np.argmin(costs)), np.ones(len(trials))
         improved = costs[pick] < enough
         for _ in range(updates):
             if not costs[pick] < enough:
                 break
-            jacobian = updated(jacobian, trials[pick] - at, values[pick] - value)
+            change = total.weighted(values[pick]) - total.weighted(value)
+            jacobian = updated(jacobian, trials[pick] - at, change)
             at, value, cost = trials[pick], values[pick], costs[pick]
             damping = float(np.clip(damping * factors[pick], 1e-4, 1e6))
             enough, factors = cost - tolerance * cost, DAMPINGS
-            trials = _trial_steps(jacobian, value, at, damping * factors, prior)
-            values, costs = _tried(residuals, trials, prior)
+            trials = _trial_steps(jacobian, value, at, damping * factors, total)
+            values, costs = total.tried(trials)
             replays += len(trials)
             pick = int(np.argmin(costs))
         if costs[pick] < cost:
@@ -227,16 +237,44 @@ def confidence(
     )
 
 
-class _Prior:
-    """A Gaussian prior as extra residuals."""
+class _Sum:
+    """What is minimised: squares of weighted residuals, and of a Gaussian prior as extra ones.
 
-    def __init__(self, start: Array, mean: Array | None, sd: Array | None) -> None:
+    Residuals go in and out without their weights, so that those of a point that was reached serve
+    under other weights too.
+    """
+
+    def __init__(
+        self,
+        residuals: Residuals,
+        weight: Array | float,
+        start: Array,
+        mean: Array | None,
+        sd: Array | None,
+    ) -> None:
+        self.residuals, self.weight = residuals, weight
         self.mean = start if mean is None else mean
-        self.weight = np.zeros(len(start)) if sd is None else 1.0 / sd
+        self.pull = np.zeros(len(start)) if sd is None else 1.0 / sd
+
+    def weighted(self, values: Array) -> Array:
+        """Residuals times their weights."""
+        return values * self.weight
 
     def cost(self, value: Array, at: Array) -> float:
-        pull = self.weight * (at - self.mean)
-        return float(value @ value + pull @ pull) / 2
+        """Half the sum at a point with these residuals."""
+        weighted, pull = self.weighted(value), self.pull * (at - self.mean)
+        return float(weighted @ weighted + pull @ pull) / 2
+
+    def tried(self, points: Array) -> tuple[Array, list[float]]:
+        """Residuals and costs of points."""
+        values = self.residuals(points)
+        return values, [self.cost(v, p) for v, p in zip(values, points, strict=True)]
+
+    def jacobian(self, at: Array, value: Array, width: float) -> Array:
+        """Of the weighted residuals, see `differences`."""
+        return differences(
+            lambda unit: self.weighted(self.residuals(unit)), at, self.weighted(value), width
+        )
 
 
 def differences(residuals: Residuals, at: Array, value: Array, width: float) -> Array:
@@ -267,26 +305,26 @@ def updated(jacobian: Array, step: Array, change: Array) -> Array:
     return np.asarray(jacobian + np.outer(change - jacobian @ step, step) / (step @ step))
 
 
-def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, prior: _Prior) -> Array:
+def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, total: _Sum) -> Array:
     """Points of damped Gauss-Newton steps within the cube, shape (n_dampings, n_parameters)."""
-    normal, gradient, scale = _normal_equations(jacobian, value, at, prior)
+    normal, gradient, scale = _normal_equations(jacobian, value, at, total)
     systems = normal + dampings[:, None, None] * np.diag(scale)
     return np.array([_step_within(system, gradient, at) for system in systems])
 
 
 def _normal_equations(
-    jacobian: Array, value: Array, at: Array, prior: _Prior
+    jacobian: Array, value: Array, at: Array, total: _Sum
 ) -> tuple[Array, Array, Array]:
     """Normal matrix, gradient, and the matrix's diagonal with a floor."""
-    normal = jacobian.T @ jacobian + np.diag(prior.weight**2)
-    gradient = jacobian.T @ value + prior.weight**2 * (at - prior.mean)
+    normal = jacobian.T @ jacobian + np.diag(total.pull**2)
+    gradient = jacobian.T @ total.weighted(value) + total.pull**2 * (at - total.mean)
     scale = np.diag(normal)
     return normal, gradient, np.maximum(scale, 1e-6 * scale.max() or 1.0)
 
 
-def _component_steps(jacobian: Array, value: Array, at: Array, prior: _Prior) -> Array:
+def _component_steps(jacobian: Array, value: Array, at: Array, total: _Sum) -> Array:
     """The components of a Gauss-Newton step by the normal matrix's eigenvectors, a row each."""
-    normal, gradient, scale = _normal_equations(jacobian, value, at, prior)
+    normal, gradient, scale = _normal_equations(jacobian, value, at, total)
     root = np.sqrt(scale)
     stiffness, directions = np.linalg.eigh(normal / np.outer(root, root))
     along = (
@@ -296,26 +334,20 @@ def _component_steps(jacobian: Array, value: Array, at: Array, prior: _Prior) ->
 
 
 def _best_parts(
-    residuals: Residuals, parts: Array, at: Array, cost: float, prior: _Prior
+    parts: Array, at: Array, cost: float, total: _Sum
 ) -> tuple[Array, Array, list[float]]:
     """Points, residuals and costs of each part of a step alone and of all that help together.
 
     A kink that one parameter meets holds a whole step back; the others go on without it.
     """
     points = np.clip(at + parts, 0.0, 1.0)
-    values, costs = _tried(residuals, points, prior)
+    values, costs = total.tried(points)
     helping = np.array(costs) < cost
     if helping.sum() < 2:
         return points, values, costs
     together = np.clip(at + parts[helping].sum(axis=0), 0.0, 1.0)[None]
-    value, least = _tried(residuals, together, prior)
+    value, least = total.tried(together)
     return np.vstack([points, together]), np.vstack([values, value]), costs + least
-
-
-def _tried(residuals: Residuals, points: Array, prior: _Prior) -> tuple[Array, list[float]]:
-    """Residuals and costs of points."""
-    values = residuals(points)
-    return values, [prior.cost(v, p) for v, p in zip(values, points, strict=True)]
 
 
 def _step_within(system: Array, gradient: Array, at: Array) -> Array:
@@ -333,8 +365,8 @@ def _step_within(system: Array, gradient: Array, at: Array) -> Array:
     return goal
 
 
-def _covariance(jacobian: Array, noise: float, prior: _Prior) -> Array:
+def _covariance(jacobian: Array, noise: float, total: _Sum) -> Array:
     """Inverse of the information, with the variance of a uniform unit prior (12) as a floor."""
     information = jacobian.T @ jacobian / max(noise, 1e-12) ** 2
-    information += np.diag(prior.weight**2 + 12.0)
+    information += np.diag(total.pull**2 + 12.0)
     return np.asarray(np.linalg.inv(information))

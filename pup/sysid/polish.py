@@ -7,6 +7,7 @@ hundreds of generations to contract to.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,41 +46,63 @@ def polish(errors: Errors, start: Array, anchor: Array | None = None) -> Array:
     Returns:
       A point on the unit cube whose objective is not higher than the start's.
     """
-    squares = SQUARES if anchor is None else ANCHORED
-    at = _squares(errors, start, anchor, squares, equal=True)
-    objective = _objective(errors, at, anchor)
+    error, blocks = errors(start[None])
+    landscape = _Landscape(errors, blocks, anchor)
+    begin = landscape.point(start, error[0])
+    best = landscape.led(begin, SQUARES if anchor is None else ANCHORED, equal=True)
     for _ in range(ROUNDS):
-        reached = _squares(errors, at, anchor, ITERATIONS, equal=False)
-        lower = _objective(errors, reached, anchor)
-        gain = objective - lower
+        reached = landscape.led(best, ITERATIONS, equal=False)
+        gain = best.objective - reached.objective
         if gain > 0:
-            at, objective = reached, lower
-        if gain < GAIN * objective:
+            best = reached
+        if gain < GAIN * best.objective:
             break
-    return at if objective < _objective(errors, start, anchor) else start
+    return best.at if best.objective < begin.objective else start
 
 
-def _squares(
-    errors: Errors, at: Array, anchor: Array | None, iterations: int, *, equal: bool
-) -> Array:
-    """Where least squares leads under the weights of a point, or under their mean."""
-    error, blocks = errors(at[None])
-    norms = _norms(error, blocks)[0]
-    widths = np.diff([*blocks, error.shape[1]])
-    typical = norms.mean() + 1e-12
-    each = np.full(len(norms), typical) if equal else np.maximum(norms, FLOOR * typical)
-    weight = np.repeat(each, widths) ** -0.5
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A point that was simulated.
 
-    def weighted(unit: Array) -> Array:
-        return np.asarray(errors(unit)[0] * weight)
+    Attributes:
+      at: where it is on the unit cube, shape (n_parameters,).
+      error: weighted as equation 1 has it, shape (n_errors,).
+      norms: of its blocks, shape (n_blocks,).
+      objective: equation 1 and the regulariser.
+    """
 
-    return least_point(weighted, at, anchor, (2 * W_REG) ** -0.5, iterations, STEP)
-
-
-def _norms(error: Array, blocks: NDArray[np.int64]) -> Array:
-    return np.asarray(np.sqrt(np.add.reduceat(error**2, blocks, axis=1)))
+    at: Array
+    error: Array
+    norms: Array
+    objective: float
 
 
-def _objective(errors: Errors, at: Array, anchor: Array | None) -> float:
-    loss = float(_norms(*errors(at[None])).sum())
-    return loss if anchor is None else loss + W_REG * float(((at - anchor) ** 2).sum())
+@dataclass(frozen=True)
+class _Landscape:
+    """Equation 1 and the regulariser over the unit cube.
+
+    Attributes:
+      errors: evaluates a batch of candidates.
+      blocks: where the errors of each norm begin, shape (n_blocks,).
+      anchor: where the regulariser pulls to, or None.
+    """
+
+    errors: Errors
+    blocks: NDArray[np.int64]
+    anchor: Array | None
+
+    def point(self, at: Array, error: Array) -> _Point:
+        """A point by its errors."""
+        norms = np.sqrt(np.add.reduceat(error**2, self.blocks))
+        pull = 0.0 if self.anchor is None else W_REG * float(((at - self.anchor) ** 2).sum())
+        return _Point(at, error, norms, float(norms.sum()) + pull)
+
+    def led(self, point: _Point, iterations: int, *, equal: bool) -> _Point:
+        """Where least squares leads under the weights of a point, or under their mean."""
+        typical = point.norms.mean() + 1e-12
+        widths = np.diff([*self.blocks, len(point.error)])
+        floored = np.maximum(point.norms, FLOOR * typical)
+        each = np.full(len(floored), typical) if equal else floored
+        weight = np.repeat(each, widths) ** -0.5
+        told = point.at, point.error, self.anchor, (2 * W_REG) ** -0.5, iterations, STEP
+        return self.point(*least_point(lambda unit: self.errors(unit)[0], weight, *told))
