@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pup.physics.parameters import ParameterSpace
-from pup.sysid.ripples import Shares, surface
+from pup.sysid import ripples
+from pup.sysid.ripples import LOOKS, SCALES, Shares, surface
 from pup.sysid.slopes import Slopes, Told, slopes
 from pup.sysid.uncertainty import over_ripples
 
@@ -105,6 +106,32 @@ def test_ripples_hide_no_parameter_and_sharpen_none() -> None:
     assert (held[:2] < 0.99).all()
     assert (width[:2] < 0.08).all()
     assert width[2] > 0.85
+
+
+def test_the_widest_scale_is_found_by_looking_at_few() -> None:
+    """The same as of all twelve, at which equation 1 rises by no more than it should."""
+    rng = np.random.default_rng(5)
+    found = []
+    for sharpness in 10.0 ** np.arange(-6, 3):
+        shares, unit = rippled(rng)
+        asked: list[int] = []
+
+        def counted(units: Array, asked: list[int] = asked, shares: Shares = shares) -> Array:
+            asked.append(len(units))
+            return shares(units)
+
+        start = np.diag([sharpness, sharpness, 1 / 12])
+        looked = NOTHING.curvature, 0.03
+        width = ripples._scaled(counted, unit, start, *looked, np.random.default_rng(0))
+        drawn = np.random.default_rng(0).normal(size=(LOOKS, 3))
+        widths = [ripples._bounded(scale**2 * start) for scale in SCALES]
+        places = [np.clip(unit + drawn @ np.linalg.cholesky(w).T, 0, 1) for w in widths]
+        risen = [(shares(p) - shares(unit[None])).mean() for p in places]
+        known = next((i for i, rise in enumerate(risen) if rise <= 0.03), len(SCALES) - 1)
+        assert np.array_equal(width, widths[known])
+        assert sum(asked) <= 1 + 4 * LOOKS
+        found.append(known)
+    assert len(set(found)) > 4
 
 
 def test_a_single_recording_is_as_uncertain_as_its_readings_make_it() -> None:

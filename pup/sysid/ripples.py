@@ -7,6 +7,7 @@ above its ripples, looks over them: its curvature tells how sharp the minimum is
 its slopes from recording to recording where it would be with others (sandwich, by recordings).
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -58,8 +59,9 @@ class Surface:
 
 
 def replays(parameters: int) -> int:
-    """How many replays a surface takes."""
-    return 1 + LOOKS * len(SCALES) + sum(ROUNDS) * _coefficients(parameters)
+    """How many replays a surface takes, at most."""
+    looks = len(SCALES).bit_length()  # of a bisection
+    return 1 + LOOKS * looks + sum(ROUNDS) * _coefficients(parameters)
 
 
 def surface(shares: Shares, unit: Array, covariance: Array, hanging: Array, rise: float) -> Surface:
@@ -122,15 +124,24 @@ def _scaled(
     rise: float,
     rng: np.random.Generator,
 ) -> Array:
-    """The covariance so much wider or narrower that equation 1 rises by as much, on average."""
+    """The covariance so much wider or narrower that equation 1 rises by as much, on average.
+
+    It rises the more the wider, so that few of the scales are looked at.
+    """
     widths = [_bounded(scale**2 * covariance) for scale in SCALES]
     drawn = rng.normal(size=(LOOKS, len(unit)))
-    off = [np.zeros((1, len(unit)))] + [drawn @ np.linalg.cholesky(w).T for w in widths]
-    seen = _look(shares, unit, np.concatenate(off))
-    level = seen.told.mean(axis=1) + ((seen.off @ hanging) * seen.off).sum(axis=1) / 2
-    risen = (level[1:] - level[0]).reshape(len(SCALES), LOOKS).mean(axis=1)
-    low = np.flatnonzero(risen <= rise)
-    return widths[int(low[0]) if len(low) else -1]
+
+    def level(off: Array) -> float:
+        seen = _look(shares, unit, off)
+        hang = ((seen.off @ hanging) * seen.off).sum(axis=1) / 2
+        return float((seen.told.mean(axis=1) + hang).mean())
+
+    highest = level(np.zeros((1, len(unit)))) + rise
+
+    def fits(scale: int) -> bool:
+        return level(drawn @ np.linalg.cholesky(widths[scale]).T) <= highest
+
+    return widths[min(bisect_left(range(len(widths)), True, key=fits), len(widths) - 1)]
 
 
 def _coefficients(parameters: int) -> int:
