@@ -1,12 +1,13 @@
 """What the minimum of a sum of norms tells of its parameters, against many draws of the noise."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pup.physics.parameters import ParameterSpace
 from pup.sysid import ripples
-from pup.sysid.ripples import LOOKS, SCALES, Shares, surface
+from pup.sysid.ripples import LOOKS, SCALES, Shares, Surface, surface
 from pup.sysid.slopes import Slopes, Told, slopes
 from pup.sysid.uncertainty import over_ripples
 
@@ -140,3 +141,21 @@ def test_a_single_recording_is_as_uncertain_as_its_readings_make_it() -> None:
     assert (held[:2] > 0.7).all()
     assert (held[:2] < 0.99).all()
     assert width[2] > 0.85
+
+
+def test_a_minimum_beyond_a_wall_lies_at_it() -> None:
+    """The interval begins there and has a width, and the others go where the wall leaves them."""
+    space = ParameterSpace(("a", "b", "c"), ("1",) * 3, np.full(3, 0.5), np.zeros(3), np.ones(3))
+    curvature, unit = SHARP + np.diag([0.0, 0.0, 1.0]), np.array([0.0, 0.5, 0.5])
+    beyond = Surface(
+        slopes=(unit - np.array([-0.3, 0.6, 0.5])) @ curvature + 0.1 * np.vstack([SHARP, -SHARP]),
+        slope_error=1e-6 * np.eye(3),
+        curvature=curvature,
+        at_least=curvature,
+        draws=np.eye(3),
+    )
+    told = over_ripples(space, unit, NOTHING, beyond, NOTHING.scatter)
+    assert told.centre == pytest.approx([0.0, 0.45, 0.5])
+    interval = told.confidence(0.9)
+    assert interval.lower[0] == 0
+    assert interval.upper[0] > 0.01

@@ -294,6 +294,27 @@ def differences(residuals: Residuals, at: Array, value: Array, width: float) -> 
     return np.asarray(((residuals(moved) - value) / step[:, None]).T)
 
 
+def step_within(system: Array, gradient: Array, at: Array) -> Array:
+    """Where a Newton step leads; what hits a wall stays there and the rest is solved again.
+
+    Args:
+      system: curvature, shape (n_parameters, n_parameters).
+      gradient: shape (n_parameters,).
+      at: where it is taken, within the unit cube.
+    """
+    free = ~(((at <= 0) & (gradient > 0)) | ((at >= 1) & (gradient < 0)))
+    goal = at.copy()
+    while free.any():
+        pull = gradient[free] + system[np.ix_(free, ~free)] @ (goal - at)[~free]
+        goal[free] = at[free] - np.linalg.solve(system[np.ix_(free, free)], pull)
+        beyond = (goal < 0) | (goal > 1)
+        if not beyond.any():
+            break
+        goal = np.clip(goal, 0.0, 1.0)
+        free &= ~beyond
+    return goal
+
+
 def updated(jacobian: Array, step: Array, change: Array) -> Array:
     """A Jacobian after a step, by Broyden: right along it, as before across it.
 
@@ -309,7 +330,7 @@ def _trial_steps(jacobian: Array, value: Array, at: Array, dampings: Array, tota
     """Points of damped Gauss-Newton steps within the cube, shape (n_dampings, n_parameters)."""
     normal, gradient, scale = _normal_equations(jacobian, value, at, total)
     systems = normal + dampings[:, None, None] * np.diag(scale)
-    return np.array([_step_within(system, gradient, at) for system in systems])
+    return np.array([step_within(system, gradient, at) for system in systems])
 
 
 def _normal_equations(
@@ -348,21 +369,6 @@ def _best_parts(
     together = np.clip(at + parts[helping].sum(axis=0), 0.0, 1.0)[None]
     value, least = total.tried(together)
     return np.vstack([points, together]), np.vstack([values, value]), costs + least
-
-
-def _step_within(system: Array, gradient: Array, at: Array) -> Array:
-    """Where a Newton step leads; what hits a wall stays there and the rest is solved again."""
-    free = ~(((at <= 0) & (gradient > 0)) | ((at >= 1) & (gradient < 0)))
-    goal = at.copy()
-    while free.any():
-        pull = gradient[free] + system[np.ix_(free, ~free)] @ (goal - at)[~free]
-        goal[free] = at[free] - np.linalg.solve(system[np.ix_(free, free)], pull)
-        beyond = (goal < 0) | (goal > 1)
-        if not beyond.any():
-            break
-        goal = np.clip(goal, 0.0, 1.0)
-        free &= ~beyond
-    return goal
 
 
 def _covariance(jacobian: Array, noise: float, total: _Sum) -> Array:

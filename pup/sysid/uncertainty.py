@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pup.physics.parameters import ParameterSpace
-from pup.sysid.gauss_newton import Confidence, confidence
+from pup.sysid.gauss_newton import Confidence, confidence, step_within
 from pup.sysid.problem import Problem
 from pup.sysid.ripples import Shares, Surface, replays, surface
 from pup.sysid.slopes import Slopes, slopes, told_at
@@ -152,8 +152,10 @@ def over_ripples(
         hanging.curvature + ground.curvature,
         hanging.scatter + ground.slope_error + (off.T @ off if count > 1 else noise),
     )
-    inverse = np.linalg.inv(hanging.curvature + ground.at_least)
-    step = -inverse @ both.gradient
+    system = hanging.curvature + ground.at_least
+    inverse = np.linalg.inv(system)
+    # A gradient that pushes against a wall leads nowhere, and says nothing of the others.
+    step = step_within(system, both.gradient, unit) - unit
     far = float(np.sqrt(step @ np.linalg.solve(ground.draws, step)))
     variance = np.diag(inverse @ both.scatter @ inverse)
     return Spread(
