@@ -124,10 +124,11 @@ class _Job:
         progress: Progress,
         threads: int,
     ) -> None:
-        if options.folds == 1 or options.folds > len(recordings):
+        apart = len(set(_originals(recordings)))
+        if options.folds == 1 or options.folds > apart:
             raise InputError(
-                f"{options.folds} folds for {len(recordings)} recordings; use 2 to their number, "
-                "for each fold leaves some out and keeps some, or 0 for none"
+                f"{options.folds} folds for {apart} recordings that repeat no other; use 2 to "
+                "their number, for each fold leaves some out and keeps some, or 0 for none"
             )
         if options.as_described and (options.folds or options.start is not None):
             raise InputError("values that are kept as described take no folds and no start")
@@ -219,9 +220,8 @@ class _Job:
         over the types, a repeat always together with what it repeats.
         """
         folds = self.options.folds
-        motions = {r.motion for r in self.recordings}
-        original = [(r.motion, r.repeat_of or r.id) for r in self.recordings]
-        unit = [r.motion for r in self.recordings] if len(motions) >= folds else original
+        motions = [(r.motion,) for r in self.recordings]
+        unit = motions if len(set(motions)) >= folds else _originals(self.recordings)
         rank = {u: at for at, u in enumerate(sorted(set(unit)))}
         return [tuple(i for i, u in enumerate(unit) if rank[u] % folds != k) for k in range(folds)]
 
@@ -336,6 +336,11 @@ class _Job:
 def _movable(space: ParameterSpace) -> list[str]:
     """The parameters of the nominal model; the description's terms stay as they are."""
     return [name for name in space.names if split_column(name) is None]
+
+
+def _originals(recordings: Sequence[Recording]) -> list[tuple[str, ...]]:
+    """Of each recording, what it is or repeats."""
+    return [(r.motion, r.repeat_of or r.id) for r in recordings]
 
 
 def _seen(problem: Problem) -> Problem:

@@ -8,6 +8,7 @@ import pytest
 from biped import biped
 from recordings import make
 
+from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid.fit import FitResult
@@ -70,3 +71,16 @@ def test_a_fold_fits_what_its_recordings_can_see(robot: RobotDescription, tmp_pa
         assert ("ground_friction" in problem.free) is on_ground
     assert held_out is not None and held_out["folds"] == 2
     assert np.isfinite([held_out["loss"], held_out["rmse"]]).all()
+
+
+def test_repeats_are_no_units_of_folds(robot: RobotDescription, tmp_path: Path) -> None:
+    """Four recordings of one motion, of which two repeat the others: two folds, and no more."""
+    every = tuple(
+        stepped(f"{name}{n}", "suspended", repeat_of=name + "1" if n == 2 else None)
+        for name in "ab"
+        for n in (1, 2)
+    )
+    job, _ = job_of(robot, every, tmp_path, Options("pd", folds=2))
+    assert job._folds() == [(2, 3), (0, 1)]
+    with pytest.raises(InputError, match="3 folds for 2 recordings that repeat no other"):
+        job_of(robot, every, tmp_path, Options("pd", folds=3))
