@@ -186,7 +186,10 @@ class _Job:
         free = tuple(
             n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
         )
-        return _seen(Problem(self.robot, self.recordings, actuator, space, free, self.threads))
+        problem = _seen(Problem(self.robot, self.recordings, actuator, space, free, self.threads))
+        if not problem.free:
+            raise InputError("nothing to fit: no parameter changes what the recordings measure")
+        return problem
 
     def _nominal(
         self, full: dict[Actuator, Problem]
@@ -228,21 +231,22 @@ class _Job:
     def _subsets(self, bounded: Problem) -> tuple[SubsetFit, ...]:
         """Algorithm 1's fits, each over the bounded parameters that its recordings can see."""
         o = self.options
-        fits = []
         drawn = draw_subsets(len(self.recordings), o.subsets, o.fraction, o.seed)
-        for i, subset in enumerate(drawn):
-            problem = _seen(bounded.of(subset))
+        problems = [_seen(bounded.of(subset)) for subset in drawn]
+        fits = {}
+        for i, problem in enumerate(problems):
             at = problem.free_space.normalise(problem.free_space.nominal)
             settings = FitSettings(
                 at, NEAR_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
             )
-            fits.append(Fit(f"subset{i}", problem, settings))
+            if problem.free:
+                fits[i] = Fit(f"subset{i}", problem, settings)
         # They start from the nominal fit: another one, after more generations, makes them others.
         place = f"subsets-{_short(bounded.digest, o.fraction)}"
-        results = self._fit("subset fits", fits, place)
+        results = dict(zip(fits, self._fit("subset fits", list(fits.values()), place), strict=True))
         return tuple(
-            _subset_fit(fit.problem, result, bounded.free)
-            for fit, result in zip(fits, results, strict=True)
+            _subset_fit(problem, results.get(i) or _described(problem), bounded.free)
+            for i, problem in enumerate(problems)
         )
 
     def _fit(self, stage: str, fits: list[Fit], place: str = "") -> list[FitResult]:
@@ -350,7 +354,7 @@ def _seen(problem: Problem) -> Problem:
 
 
 def _described(problem: Problem) -> FitResult:
-    """The description's values, as a fit would tell them."""
+    """The nominal values, as a fit would tell them that finds no better ones."""
     start = problem.free_space.normalise(problem.free_space.nominal)
     return FitResult(start, float(problem.losses(start[None])[0]), np.empty(0))
 

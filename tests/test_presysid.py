@@ -84,3 +84,34 @@ def test_repeats_are_no_units_of_folds(robot: RobotDescription, tmp_path: Path) 
     assert job._folds() == [(2, 3), (0, 1)]
     with pytest.raises(InputError, match="3 folds for 2 recordings that repeat no other"):
         job_of(robot, every, tmp_path, Options("pd", folds=3))
+
+
+def unread(id_: str) -> Recording:
+    """A step of which nothing was read but where it began."""
+    position = np.full((TICKS, 2), np.nan)
+    position[0] = 0.0
+    return stepped(id_, "suspended", position=position)
+
+
+def test_where_nothing_was_read_there_is_nothing_to_fit(
+    robot: RobotDescription, tmp_path: Path
+) -> None:
+    job, _ = job_of(robot, (unread("a"), unread("b")), tmp_path, Options("pd"))
+    with pytest.raises(InputError, match="nothing to fit: no parameter changes"):
+        job._problem("pd")
+
+
+def test_a_subset_that_sees_nothing_is_not_searched(
+    robot: RobotDescription, tmp_path: Path
+) -> None:
+    every = (stepped("a", "suspended"), unread("b"), unread("c"))
+    options = Options("pd", subsets=6, compare=False)
+    job, runner = job_of(robot, every, tmp_path, options)
+    problem = job._problem("pd")
+    subsets = job._subsets(problem)
+    blind = ["a" not in subset.recordings for subset in subsets]
+    assert any(blind) and not all(blind)
+    assert len(subsets) == 6 and len(runner.fits) == 6 - sum(blind)
+    for subset, nothing in zip(subsets, blind, strict=True):
+        assert np.isnan(subset.values).all() == nothing
+        assert not nothing or subset.loss == 0
