@@ -269,7 +269,9 @@ class _Job:
         spread = spread_at(bounded, at, self._uncertainty)
         known, together = spread.confidence(0.9), spread.together(0.95)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
-        if not self.options.as_described:  # the interval is of a minimum, which kept values are not
+        # An interval is of a minimum, which kept values are not: it does not widen their range. It
+        # is told all the same, and by the surface: slopes alone would call parameters identified.
+        if not self.options.as_described:
             lower, upper = widened(lower, upper, (together.lower, together.upper), space)
         lower = np.where(spread.unseen, space.lower, lower)
         upper = np.where(spread.unseen, space.upper, upper)

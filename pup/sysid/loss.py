@@ -23,7 +23,7 @@ FALLING = frozenset(("fall",))
 LOST_POSITION = np.pi
 """Error counted per joint or angle of a simulation that broke down, rad."""
 LOST_FOOT = 1.0
-"""The same for a foot, m."""
+"""The same along each axis of a foot, m, from tick to tick."""
 
 
 @dataclass(frozen=True)
