@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pup.errors import InputError
+from pup.sysid import fit
 from pup.sysid.fit import W_REG, CmaFit, FitResult, FitSettings, run_fit
 
 SPHERE = FitSettings(np.full(5, 0.4), population=8, generations=12, seed=3)
@@ -210,6 +211,17 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path, change: str) -> 
     with pytest.raises(InputError, match="other recordings or settings"):
         run_fit(others[change], sphere, checkpoint, problem=problem)
     run_fit(SPHERE, sphere, checkpoint, problem="a")
+
+
+def test_a_checkpoint_of_another_way_to_search_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its polished point is where other constants led."""
+    checkpoint = tmp_path / "fit.npz"
+    run_fit(SPHERE, sphere, checkpoint, polish=lambda best: np.full(5, 0.6))
+    monkeypatch.setattr(fit, "SEARCH", fit.SEARCH + 1)
+    with pytest.raises(InputError, match="other recordings or settings"):
+        run_fit(SPHERE, sphere, checkpoint, polish=lambda best: np.full(5, 0.7))
 
 
 def test_the_regulariser_pulls() -> None:

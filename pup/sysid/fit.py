@@ -18,6 +18,9 @@ from pup.files import write_atomic
 
 Array = NDArray[np.float64]
 
+SEARCH = 1
+"""Raised with every change of how a fit searches or is polished, the constants of both included,
+which makes old checkpoints another's."""
 W_REG = 0.05
 """Weight of the pull towards the nominal parameters, on the unit cube (paper, section III-A)."""
 
@@ -59,7 +62,7 @@ class FitSettings:
     @property
     def digest(self) -> str:
         """Identifies the search, whatever its number of generations."""
-        parts = (self.start, self.sigma, self.population, self.seed, self.anchor)
+        parts = (SEARCH, self.start, self.sigma, self.population, self.seed, self.anchor)
         return hashlib.sha256(repr([np.asarray(p).tolist() for p in parts]).encode()).hexdigest()
 
 

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 MODEL = 8
 """Raised with every change of the physics or the loss, which makes old checkpoints another's."""
-_VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "nevergrad", "cma")))
+_VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "numba", "nevergrad", "cma")))
 
 
 @dataclass(frozen=True, eq=False)
