@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pup.diagnosis.knocks import SHAKEN, knocked
+from pup.diagnosis.replays import some
 from pup.diagnosis.residuals import SETTLING, Measured
 from pup.physics.model import compile_model
 from pup.recording import Recording
@@ -43,6 +44,16 @@ def test_a_third_of_a_second_after_a_blow_is_left_out() -> None:
     kept = Measured.of(LEG, [fallen])
     counted = int((~left_out & (fallen.time >= SETTLING)).sum())
     assert (np.bincount(kept.channel)[: len(LEG.joints)] == counted).all()
+
+
+def test_how_a_recording_begins_leaves_out_what_the_whole_does() -> None:
+    """A blow in the first second shakes much of that second, and little of the recording."""
+    knee = np.full(200, END - 0.5)
+    knee[15:] = END + 0.05
+    whole = Measured.of(LEG, [recording(knee)])
+    begun = some(whole, [0], 1.0)
+    assert np.array_equal(begun.values, whole.values[whole.time < 1.0])
+    assert np.array_equal(begun.time, whole.time[whole.time < 1.0])
 
 
 def test_who_leans_on_a_stop_or_comes_to_it_slowly_loses_nothing() -> None:

@@ -83,9 +83,8 @@ class Bench:
 def some(measured: Measured, recordings: Sequence[int], until: float | None) -> Measured:
     """The samples of some recordings, or of how they begin."""
     chosen = [measured.recordings[i] for i in recordings]
-    if until is not None:
-        chosen = [beginning(recording, until) for recording in chosen]
-    return Measured.of(measured.robot, chosen)
+    parts = chosen if until is None else [beginning(recording, until) for recording in chosen]
+    return Measured.of(measured.robot, parts, chosen)
 
 
 Runner = Callable[[Sequence[Batch]], list[Array]]

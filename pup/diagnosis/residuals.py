@@ -85,18 +85,29 @@ class Measured:
     time: Array
 
     @classmethod
-    def of(cls, robot: RobotDescription, recordings: Sequence[Recording]) -> "Measured":
-        """The samples of some recordings."""
+    def of(
+        cls,
+        robot: RobotDescription,
+        recordings: Sequence[Recording],
+        wholes: Sequence[Recording] | None = None,
+    ) -> "Measured":
+        """The samples of some recordings.
+
+        Args:
+          robot: the robot.
+          recordings: its recordings.
+          wholes: what each is the beginning of: whether a stop was met, a whole recording tells.
+        """
         steadied = tuple(steady_start(recording) for recording in recordings)
         joints = len(robot.joints)
         ticks = sum(len(r.time) for r in steadied)
         parts = []
-        for number, (recording, part) in enumerate(
-            zip(steadied, tick_slices(steadied), strict=True)
+        for number, (recording, whole, part) in enumerate(
+            zip(steadied, wholes or steadied, tick_slices(steadied), strict=True)
         ):
             elapsed = recording.time - recording.time[0]
             rows = np.arange(part.start, part.stop)
-            told = (elapsed >= SETTLING) & ~knocked(robot, recording)
+            told = (elapsed >= SETTLING) & ~knocked(robot, whole)[: len(elapsed)]
             for channel, values in enumerate(_channels(robot, recording)):
                 kept = ~np.isnan(values) & told
                 where = rows * joints + channel
