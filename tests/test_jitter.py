@@ -7,6 +7,7 @@ from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.jitter import jitter
+from pup.diagnosis.lacks import repeated
 from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.verdict import unexplained_errors
@@ -58,6 +59,14 @@ def test_what_repeats_is_no_jitter() -> None:
     model = left(noise + missing)
     assert jitter(model) is None
     assert np.array_equal(unexplained_errors(model), noise + missing)
+
+
+def test_uneven_noise_repeats_no_more_than_even_noise() -> None:
+    """Errors that both repeats have at the same times, large ones among small, are no surprise."""
+    rng = np.random.default_rng(5)
+    size = np.where(np.sin(9 * MEASURED.time) > 0.9, 20.0, 1.0)
+    told = [repeated(MEASURED, size * rng.normal(size=len(size)))[0] for _ in range(200)]
+    assert np.std([one.surprise for one in told]) == pytest.approx(1, abs=0.2)
 
 
 def test_without_a_delay_there_is_nothing_to_jitter() -> None:

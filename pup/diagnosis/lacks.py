@@ -1,6 +1,5 @@
 """How far a model's errors are from noise, channel by channel."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +90,7 @@ def lack_of_fit(
 
 def repeated(measured: Measured, residual: Array) -> dict[int, Repeated]:
     """What a model's errors share between a motion and its repeats, by channel."""
-    told: dict[int, list[tuple[Array, Array]]] = {}
+    told: dict[int, list[Array]] = {}
     for first, second in repeats(measured):
         for channel in range(measured.channels):
             one, other = (
@@ -100,13 +99,11 @@ def repeated(measured: Measured, residual: Array) -> dict[int, Repeated]:
             if min(one.sum(), other.sum()) < FEWEST:
                 continue
             matched = np.interp(measured.time[one], measured.time[other], residual[other])
-            told.setdefault(channel, []).append((residual[one] * matched, matched))
-    return {channel: _shared(parts) for channel, parts in told.items()}
+            told.setdefault(channel, []).append(residual[one] * matched)
+    return {channel: _shared(np.concatenate(parts)) for channel, parts in told.items()}
 
 
-def _shared(parts: Sequence[tuple[Array, Array]]) -> Repeated:
-    """From the products of errors of repeats, and the second's errors alone."""
-    products, known = (np.hstack([part[i] for part in parts]) for i in (0, 1))
-    return Repeated(
-        float(products.mean()), float(products.sum() / max(np.sqrt((known**2).sum()), 1e-300))
-    )
+def _shared(products: Array) -> Repeated:
+    """From the products of errors of repeats, which may be as uneven as the errors are."""
+    deviation = max(np.sqrt((products**2).sum()), 1e-300)
+    return Repeated(float(products.mean()), float(products.sum() / deviation))
