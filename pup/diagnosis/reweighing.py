@@ -89,9 +89,7 @@ class Reweighing:
     def _round(self, chosen: Round, models: Mapping[Model, Model], selector: Selector) -> Round:
         before = models[chosen.before]
         first, *others = (models[m] for m in _worth_keeping(chosen))
-        ordered = sorted(others, key=lambda m: m.worth)
-        holds = [m for m in ordered if selector.holds(before, m)]
-        rest = [m for m in ordered if m not in holds]
+        holds, rest = selector.parted(before, others)
         return Round(
             before, self._ranking(chosen, before.fit), (first, *holds, *rest), 1 + len(holds)
         )

@@ -140,13 +140,14 @@ class Selector:
         better = self._ended(same[0])
         if better.worth > model.worth - self.enough / 2:
             return None
+        before = self._less(model, number)
+        if not self.holds(before, better):
+            return None
         given_up = model.hypotheses[number]
-        others = tuple(h for h in model.hypotheses if h is not given_up)
-        known_as = replace(model, hypotheses=(*others, given_up))
-        rest = sorted([*same[1:], known_as], key=lambda m: m.worth)
-        before = self.model(others, self.without(model)[number])
+        known_as = replace(model, hypotheses=(*before.hypotheses, given_up))
+        holds, others = self.parted(before, [*same[1:], known_as])
         ranking = chosen_in(rounds, given_up.key).ranking
-        return Round(before, ranking, (better, *rest), 1 + len(rest))
+        return Round(before, ranking, (better, *holds, *others), 1 + len(holds))
 
     def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
         """Models with a rival in place of an effect, and which of them that is."""
@@ -176,6 +177,11 @@ class Selector:
         """A fitted model with its predictions of the folds."""
         return self.models([(tuple(hypotheses), fit)])[0]
 
+    def _less(self, model: Model, number: int) -> Model:
+        """The model without one of its effects."""
+        others = [h for i, h in enumerate(model.hypotheses) if i != number]
+        return self.model(others, self.without(model)[number]) if others else self.nominal
+
     def without(self, model: Model) -> list[Fit]:
         """The model refitted without each of its effects in turn."""
         of, known = self._lesser
@@ -202,11 +208,9 @@ class Selector:
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         if not better:
             return Round(model, tuple(ranking), (), 0)
-        finalists = sorted(self.models(better), key=lambda m: m.worth)
-        holds = [m for m in finalists if self.holds(model, m)]
+        holds, others = self.parted(model, self.models(better))
         if holds:
             holds[0] = self._ended(holds[0])
-        others = [m for m in finalists if m not in holds]
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
     def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
@@ -287,6 +291,14 @@ class Selector:
         ]
         closely(close, self.replays, self.noise)
 
+    def parted(
+        self, before: Model, finalists: Sequence[Model]
+    ) -> tuple[list[Model], list[Model]]:
+        """Finalists that hold against a model, and those that do not, the best first of each."""
+        ordered = sorted(finalists, key=lambda m: m.worth)
+        holds = [m for m in ordered if self.holds(before, m)]
+        return holds, [m for m in ordered if m not in holds]
+
     def holds(self, before: Model, after: Model) -> bool:
         """Whether an effect keeps its gain where it was not fitted, and matters."""
         inside = before.fit.chi2 - after.fit.chi2
@@ -310,8 +322,7 @@ class Selector:
             spare = int(np.argmin(costs))
             if costs[spare] > self.enough:
                 return model
-            left = [h for i, h in enumerate(model.hypotheses) if i != spare]
-            model = self._ended(self.model(left, fits[spare])) if left else self.nominal
+            model = self._ended(self._less(model, spare))
         return model
 
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:

@@ -1,0 +1,97 @@
+"""Which effects are exchanged, refitted and looked at again, on models made up of whole cloth."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pup.diagnosis import selection
+from pup.diagnosis.hypotheses import Hypothesis, hypotheses
+from pup.diagnosis.models import Model, Round
+from pup.diagnosis.selection import Selector
+from pup.diagnosis.starts import Tried
+from pup.robot import RobotDescription
+from tests.diagnoses import ENOUGH, Maker
+
+MAKER = Maker(RobotDescription.load("darwin_leg"))
+FIRST, RIVAL, OTHER, LAST = (
+    next(h for h in hypotheses(MAKER.measured) if h.effect == effect)
+    for effect in ("coulomb_friction", "quadratic_damping", "armature", "command_delay")
+)
+Worths = Mapping[tuple[Hypothesis, ...], float]
+
+
+def nothing(*asked: object, **more: object) -> None:
+    """Fits stay where they are."""
+
+
+def made(known: Sequence[Hypothesis], worth: float) -> Model:
+    """A model of some worth, all of it chi-squared, in and out of sample."""
+    model = MAKER.model(known[-1] if known else None, 1.0)
+    fit = replace(model.fit, chi2=worth)
+    return replace(model, hypotheses=tuple(known), freedom=0, fit=fit, held_out=np.array([worth]))
+
+
+class Made(Selector):
+    """A selector that simulates nothing: what each set of effects is worth is given."""
+
+    def __init__(self, worths: Worths, unfit: Sequence[Hypothesis] = ()) -> None:
+        self.replays: Any = SimpleNamespace(measured=MAKER.measured)
+        self.noise, self.enough = MAKER.noise, ENOUGH
+        self.worths, self.unfit = worths, unfit
+        self.nominal = made((), 1000.0)
+
+    def models(self, fitted: Sequence[Tried]) -> list[Model]:
+        return [made(known, self.worths[known]) for known, _ in fitted]
+
+    def without(self, model: Model) -> list[Any]:
+        return [None] * len(model.hypotheses)
+
+    def holds(self, before: Model, after: Model) -> bool:
+        return after.hypotheses[-1] not in self.unfit
+
+    def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
+        """With fits as good as their models."""
+        ways = super()._exchanges(model, rounds)
+        return [
+            (n, (known, replace(fit, chi2=self.worths[known]))) for n, (known, fit) in ways
+        ]
+
+
+@pytest.fixture(autouse=True)
+def still(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("fit_together", "closely"):
+        monkeypatch.setattr(selection, name, nothing)
+
+
+def chosen(before: Model, *finalists: Model) -> Round:
+    return Round(before, (), finalists, len(finalists))
+
+
+class TestSwaps:
+    """Of the first of two effects, whose rivals explain more with the second."""
+
+    found = made((FIRST, LAST), 400.0)
+    rounds = (
+        chosen(made((), 1000.0), made((FIRST,), 700.0), made((RIVAL,), 705.0), made((OTHER,), 710.0)),
+        chosen(made((FIRST,), 700.0), found),
+    )
+    worths: Worths = {(LAST, RIVAL): 300.0, (LAST, OTHER): 350.0, (LAST,): 900.0}
+
+    def test_a_better_rival_takes_the_place_of_an_effect(self) -> None:
+        swap = Made(self.worths)._swap(self.found, self.rounds)
+        assert swap is not None
+        assert [m.hypotheses[-1] for m in swap.finalists] == [RIVAL, OTHER, FIRST]
+        assert swap.holding == 3
+
+    def test_a_rival_that_does_not_hold_takes_none(self) -> None:
+        assert Made(self.worths, [RIVAL])._swap(self.found, self.rounds) is None
+
+    def test_of_those_behind_only_what_holds_is_a_rival(self) -> None:
+        swap = Made(self.worths, [OTHER])._swap(self.found, self.rounds)
+        assert swap is not None
+        assert [m.hypotheses[-1] for m in swap.finalists] == [RIVAL, FIRST, OTHER]
+        assert swap.holding == 2
