@@ -95,3 +95,23 @@ class TestSwaps:
         assert swap is not None
         assert [m.hypotheses[-1] for m in swap.finalists] == [RIVAL, FIRST, OTHER]
         assert swap.holding == 2
+
+
+class TestTheLast:
+    """Of an effect that was found last, or alone, whose rivals are weighed by another noise."""
+
+    found = made((FIRST,), 700.0)
+    worths: Worths = {(RIVAL,): 690.0, (OTHER,): 710.0}
+
+    def test_it_is_exchanged_where_a_rival_is_worth_more_by_now(self) -> None:
+        rounds = [chosen(made((), 1000.0), self.found, made((RIVAL,), 695.0))]
+        selector = Made(self.worths)
+        swap = selector._swap(self.found, rounds)
+        assert swap is not None
+        assert [m.hypotheses for m in swap.finalists] == [(RIVAL,), (FIRST,)]
+        assert swap.before is selector.nominal
+
+    def test_it_stays_where_it_is_still_the_best(self) -> None:
+        rounds = [chosen(made((), 1000.0), self.found, made((OTHER,), 705.0))]
+        assert Made(self.worths)._swap(self.found, rounds) is None
+        assert Made({(OTHER,): 0.0})._swap(self.found, rounds) is None

@@ -80,6 +80,11 @@ class Round:
         """The effect that was found best."""
         return self.finalists[0].hypotheses[-1]
 
+    @property
+    def settled(self) -> bool:
+        """Whether what was added is still the best of what holds, whatever noise weighs by."""
+        return self.finalists[0].worth <= min(m.worth for m in self.finalists[: self.holding])
+
 
 def chosen_in(rounds: Sequence[Round], key: tuple[str, Place]) -> Round:
     """The last of the rounds that chose an effect: by then more of the others was known."""

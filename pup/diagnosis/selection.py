@@ -127,18 +127,22 @@ class Selector:
     def _swap(self, model: Model, rounds: Sequence[Round]) -> Round | None:
         """An effect exchanged for a rival of its own round, where what came later prefers that.
 
-        The first effects are chosen while others still hide; the last knows all of them.
+        The first effects are chosen while others still hide. The last knows all of them; it was
+        chosen by worth alone, and is given up for what noise told anew makes worth more.
         """
         ways = self._exchanges(model, rounds)
-        tried = [one for _, one in ways]
-        fit_together([fit for _, fit in tried], self.replays, self.noise, iterations=ROUGH)
-        chi2 = [fit.chi2 for _, fit in tried]
-        if not chi2 or min(chi2) > model.fit.chi2 - self.enough:
+        if not ways:
             return None
-        number = ways[int(np.argmin(chi2))][0]
+        fit_together([fit for _, (_, fit) in ways], self.replays, self.noise, iterations=ROUGH)
+        last = len(model.hypotheses) - 1
+        closely([fit for n, (_, fit) in ways if n == last], self.replays, self.noise)
+        number, (_, best) = min(ways, key=lambda way: way[1][1].chi2)
+        margin = self.enough if number < last else 0.0
+        if best.chi2 > model.fit.chi2 - margin:
+            return None
         same = sorted(self.models([one for n, one in ways if n == number]), key=lambda m: m.worth)
         better = self._ended(same[0])
-        if better.worth > model.worth - self.enough / 2:
+        if better.worth > model.worth - margin / 2:
             return None
         before = self._less(model, number)
         if not self.holds(before, better):
@@ -154,12 +158,14 @@ class Selector:
         known = {h.key for h in model.hypotheses}
         last = {r.chosen.key: r for r in rounds if r.accepted}
         ways: list[tuple[int, Tried]] = []
-        for number, hypothesis in enumerate(model.hypotheses[:-1]):
+        for number, hypothesis in enumerate(model.hypotheses):
             others = tuple(h for h in model.hypotheses if h is not hypothesis)
             if hypothesis.key not in last:  # it was known from the start
                 continue
-            finalists = last[hypothesis.key].finalists[1:]
-            rivals = [m for m in finalists if m.hypotheses[-1].key not in known]
+            chosen = last[hypothesis.key]
+            if hypothesis is model.hypotheses[-1] and chosen.settled:
+                continue
+            rivals = [m for m in chosen.finalists[1:] if m.hypotheses[-1].key not in known]
             for rival in rivals[:RIVALS]:
                 new = rival.hypotheses[-1]
                 fit = joined(less(model.fit, hypothesis), rival.fit, new)
