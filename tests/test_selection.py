@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from pup.diagnosis import selection
+from pup.diagnosis.evidence import Projector, Trace
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.selection import Selector
@@ -115,3 +117,22 @@ class TestTheLast:
         rounds = [chosen(made((), 1000.0), self.found, made((OTHER,), 705.0))]
         assert Made(self.worths)._swap(self.found, rounds) is None
         assert Made({(OTHER,): 0.0})._swap(self.found, rounds) is None
+
+
+def test_an_effect_that_was_given_up_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there are more hypotheses than are simulated again around each model."""
+    for name in ("LEADING", "MOST"):
+        monkeypatch.setattr(selection, name, 3)
+
+    def traces(asked: Sequence[Hypothesis], fit: Fit, *more: object) -> list[Trace]:
+        return [MAKER.trace(h, Projector(fit.slopes)) for h in asked]
+
+    monkeypatch.setattr(selection, "traces", traces)
+    nominal, with_first, with_rival = (
+        MAKER.model(known, error) for known, error in ((None, 3.0), (FIRST, 2.0), (RIVAL, 1.0))
+    )
+    selector = Made({})
+    selector.base, selector._seen = nominal.fit, {}
+    selector.found = tuple(traces(hypotheses(MAKER.measured), nominal.fit))
+    assert FIRST.key not in {t.hypothesis.key for t in selector._traces(with_first)}
+    assert FIRST.key in {t.hypothesis.key for t in selector._traces(with_rival)}

@@ -126,7 +126,9 @@ def search_on(
         closely([fit], replays, nominal.noise)
         complete([fit], replays, nominal.noise)
     near = done.selector.base is done.model.fit
-    latest = turned.traces(done.selector.found, fit)
+    own = {h.key for h in known}
+    others = (t for t in done.selector.found if t.hypothesis.key not in own)
+    latest = [*turned.traces(others, fit), *(t for t in found if t.hypothesis.key in own)]
     around = fit if near else base
     told = _teller(progress)
     selector = Selector(replays, nominal.noise, latest, enough, nominal.fit, around, most, told)

@@ -250,12 +250,16 @@ class Selector:
         return [t for t in self.found if t.hypothesis.key not in known]
 
     def _traced_anew(self, fit: Fit, rest: Sequence[Hypothesis]) -> tuple[Trace, ...]:
-        """Traces around a fit; where there are many, those of the hopeless as they were."""
+        """Traces around a fit; where there are many, those of the hopeless as they were.
+
+        So are those of what the fit has: an effect that is given up may be asked for again.
+        """
         project = Projector(fit.slopes)
         kept = {h.key for h in rest}
-        before = (t for t in self.found if t.hypothesis.key in kept)
-        known = (traced(t.hypothesis, t.whole, project) for t in before)
-        old = {t.hypothesis: t for t in known if t is not None}
+        before = [t for t in self.found if t.hypothesis.key in kept]
+        known = [t for t in self.found if t.hypothesis.key not in kept]
+        around = (traced(t.hypothesis, t.whole, project) for t in before)
+        old = {t.hypothesis: t for t in around if t is not None}
         place: dict[tuple[str, Place], int] = {}
         for rank, score in enumerate(scores(list(old.values()), unimitated(fit))):
             place.setdefault(score.trace.hypothesis.key, rank)  # by the best of its forms
@@ -266,7 +270,7 @@ class Selector:
         if more and _changed(old, new) > 0.5:
             leading, new = [*leading, *more], new + traces(more, fit, self.replays, self.noise)
         again = {h.key for h in leading}
-        return (*new, *(t for t in old.values() if t.hypothesis.key not in again))
+        return (*new, *(t for t in old.values() if t.hypothesis.key not in again), *known)
 
     def blur(self, model: Model, share: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
