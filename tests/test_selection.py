@@ -136,3 +136,16 @@ def test_an_effect_that_was_given_up_is_looked_at_again(monkeypatch: pytest.Monk
     selector.found = tuple(traces(hypotheses(MAKER.measured), nominal.fit))
     assert FIRST.key not in {t.hypothesis.key for t in selector._traces(with_first)}
     assert FIRST.key in {t.hypothesis.key for t in selector._traces(with_rival)}
+
+
+def test_rivals_of_other_classes_are_compared_as_closely_as_the_best(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However many forms of the best one stand between them."""
+    ended: list[Fit] = []
+    monkeypatch.setattr(selection, "closely", lambda fits, *more: ended.extend(fits))
+    known = [FIRST] * 6 + [RIVAL, OTHER, LAST]
+    fits = [replace(MAKER.model(h, 1.0).fit, chi2=5000.0 + i) for i, h in enumerate(known)]
+    fits[-1].chi2 = 6000.0
+    Made({})._refit([((h,), fit) for h, fit in zip(known, fits, strict=True)], 9000.0)
+    assert [fit.chi2 for fit in ended] == [fit.chi2 for fit in fits[:-1]]

@@ -42,7 +42,8 @@ FIRST, ROUGH = 2, 5
 HOPE = 0.5
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
-"""So many of them are refitted to the end, if they are within so much chi-squared of the best."""
+"""So many of other classes than the best one's are refitted to the end, if they are within so much
+chi-squared of it."""
 LEADING, MOST = 80, 400
 """Hypotheses that are simulated again around a model that has an effect more: those that looked
 most like its errors before, and so many more where that was no guide."""
@@ -292,14 +293,14 @@ class Selector:
         fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
         ranked = sorted(tried, key=lambda one: one[1].chi2)
         family, least = ranked[0][0][-1].family, ranked[0][1].chi2
+        own = [fit for known, fit in ranked if known[-1].family == family]
+        others = [fit for known, fit in ranked if known[-1].family != family]
         close = [
             fit
-            for rank, (hypotheses, fit) in enumerate(ranked)
-            if hypotheses[-1].family == family
-            or fit is fits[0]
-            or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
+            for rank, fit in enumerate(others)
+            if fit is fits[0] or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
         ]
-        closely(close, self.replays, self.noise)
+        closely([*own, *close], self.replays, self.noise)
 
     def parted(
         self, before: Model, finalists: Sequence[Model]
