@@ -157,7 +157,7 @@ def certified(nominal: Nominal, replays: Replays, rng: np.random.Generator) -> N
     recovered, left = _refit_of_itself(fit, replays, nominal.noise, rng)
     apart, near = told.starts[1] - told.starts[0], SPARE * told.samples
     if apart < ((OTHER - 1) * fit.chi2 if _noise_like(fit) else near):
-        left = max(left, apart)
+        left = max(left, min(apart, near))  # a fit to the noise has no more to gain
     return replace(nominal, certificate=replace(told, recovered=recovered, left=left))
 
 

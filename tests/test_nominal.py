@@ -1,0 +1,36 @@
+"""What the certificate of a nominal fit says of how far it may be from its minimum."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from pup.diagnosis import nominal
+from pup.diagnosis.nominal import SPARE, Certificate, Nominal, certified
+from pup.robot import RobotDescription
+from tests.diagnoses import Maker
+
+MAKER = Maker(RobotDescription.load("servo_bench"))
+SHORT = 3.0
+"""Chi-squared by which a refit of its own simulation stops short."""
+
+
+@pytest.mark.parametrize(
+    ("apart", "left"),
+    [
+        (0.001, SHORT),  # shares of the samples
+        (0.015, 0.015 * MAKER.samples),
+        (0.3, SPARE * MAKER.samples),  # it has not that much to gain
+        (0.9, SHORT),  # elsewhere
+    ],
+)
+def test_a_fit_to_the_noise_may_have_left_a_little_of_it(
+    apart: float, left: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nominal, "_refit_of_itself", lambda *asked: (1.0, SHORT))
+    count = float(MAKER.samples)
+    fit = replace(MAKER.fit(None, 1.0), chi2=count)
+    told = Certificate((count, (1 + apart) * count), True, samples=MAKER.samples)
+    nothing: Any = None  # what a refit would need
+    done = certified(Nominal(fit, MAKER.noise, told), nothing, nothing)
+    assert done.certificate.left == pytest.approx(left)
