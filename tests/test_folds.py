@@ -1,9 +1,49 @@
-"""What leaving out types of motion says of a fit."""
+"""What is left out together, and what that says of a fit."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from pup.diagnosis.folds import scatter
+from pup.diagnosis.folds import folds, scatter
+from pup.diagnosis.residuals import Measured
+from pup.diagnosis.verdict import held_out
+from pup.recording import Recording
+from pup.robot import RobotDescription
+from tests.diagnoses import Maker
+from tests.diagnosis_cases import BENCH, recordings
+
+RUNS = recordings({})
+"""The second one does the first again."""
+
+
+def left_out(runs: Sequence[Recording]) -> list[list[int]]:
+    replays: Any = SimpleNamespace(measured=Measured.of(BENCH, runs))
+    return folds(replays)
+
+
+def test_a_motion_done_again_is_left_out_with_it() -> None:
+    """A fit that has seen the one has seen the other."""
+    assert left_out(RUNS) == [[0, 1], [2], [3], [4]]
+    alike = [replace(run, motion="step") for run in RUNS]
+    assert left_out(alike) == [[0, 1], [2], [3], [4]]
+    assert left_out(alike[:2]) == [[0], [1]]  # there is nothing else
+
+
+def test_a_motion_done_often_makes_no_interval_narrower() -> None:
+    """Of two motions one is predicted worse, however often it is done."""
+    maker = Maker(RobotDescription.load("servo_bench"), motions=["step"] * 9)
+    runs = maker.measured.recordings
+    again = [replace(run, repeat_of=runs[1].id) for run in runs[2:]]
+    measured = replace(maker.measured, recordings=(*runs[:2], *again))
+    before, after = maker.model(None, 2.0), maker.model(None, 2.0)
+    worse = np.where(measured.recording == 0, 1.0, 3.0)
+    after = replace(after, predicted=measured.values + worse * (before.predicted - measured.values))
+    low, high = held_out(measured, before, after, 0).interval
+    assert (low, high) == (1 - 3.0, 0.0)
 
 
 def test_the_scatter_of_a_mean_is_its_students_interval() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.engine import diagnose
-from pup.diagnosis.noise import noise_floor
+from pup.diagnosis.noise import noise_floor, repeats
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Bench, threads
 from pup.diagnosis.residuals import Measured
@@ -82,6 +82,19 @@ def test_without_repeats_or_with_impacts_nothing_is_said() -> None:
     ground = Measured.of(BENCH, runs)
     ground = replace(ground, recordings=tuple(replace(r, support="ground") for r in runs))
     assert unrepeated(ground, errors, noise, []) is None
+
+
+def test_a_motion_done_again_with_something_changed_is_no_repeat() -> None:
+    runs = recordings(NONE)
+    third = replace(runs[1], id="step_again")
+    told = [repeats(Measured.of(BENCH, [*runs[:2], again, third])) for again in changed(runs[1])]
+    assert told == [[(0, 1), (1, 3)]] * 2
+
+
+def changed(run: Recording) -> list[Recording]:
+    """A recording with another setup, and with another support."""
+    other = replace(run, id="step_changed")
+    return [replace(other, setup={"payload": 0.5}), replace(other, support="suspended")]
 
 
 def test_a_servo_that_sticks_now_and_then_is_no_noisy_encoder() -> None:

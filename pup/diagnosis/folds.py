@@ -6,6 +6,7 @@ from scipy import stats
 
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Measured
 
 Array = NDArray[np.float64]
 
@@ -14,9 +15,15 @@ NOMINAL, TYPICAL = 0.2, 0.5
 
 
 def folds(replays: Replays) -> list[list[int]]:
-    """What is left out together: types of motion, or where there is one, recordings."""
+    """What is left out together: types of motion, or where there is one, motions."""
     types = list(replays.measured.motions().values())
-    return types if len(types) > 1 else [[i] for i in range(len(replays.measured.recordings))]
+    return types if len(types) > 1 else apart(replays.measured)
+
+
+def apart(measured: Measured) -> list[list[int]]:
+    """Recordings by motion, as one done again tells little new; by themselves, where all are one."""
+    families = list(measured.families().values())
+    return families if len(families) > 1 else [[i] for i in range(len(measured.recordings))]
 
 
 def left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:

@@ -207,15 +207,13 @@ def _moments(parts: Sequence[Array]) -> tuple[float, float]:
 
 def repeats(measured: Measured) -> list[tuple[int, int]]:
     """Pairs of recordings of one motion done again under one setup."""
-    names = {r.id: i for i, r in enumerate(measured.recordings)}
-    families: dict[str, list[int]] = {}
-    for number, recording in enumerate(measured.recordings):
-        first = recording.repeat_of if recording.repeat_of in names else recording.id
-        families.setdefault(str(first), []).append(number)
-    pairs = []
-    for members in families.values():
-        pairs += list(pairwise(members))
-    return pairs
+    alike: dict[object, list[int]] = {}
+    for first, members in measured.families().items():
+        for number in members:
+            recording = measured.recordings[number]
+            setup = recording.support, tuple(sorted(recording.setup.items()))
+            alike.setdefault((first, setup), []).append(number)
+    return [pair for members in alike.values() for pair in pairwise(members)]
 
 
 def differences(measured: Measured, errors: Array) -> list[Difference]:

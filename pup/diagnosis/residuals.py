@@ -187,6 +187,13 @@ class Measured:
             types.setdefault(recording.motion, []).append(number)
         return types
 
+    def families(self) -> dict[str, list[int]]:
+        """The recordings of each motion, with those that do it again."""
+        told: dict[str, list[int]] = {}
+        for number, recording in enumerate(self.recordings):
+            told.setdefault(recording.repeat_of or recording.id, []).append(number)
+        return told
+
 
 def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:
     """Positions in the robot's order, then roll and pitch where the torso is free."""

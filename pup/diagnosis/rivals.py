@@ -56,7 +56,7 @@ class Rivals:
       errors: by model: `nominal`, `nn_pd` (where the robot describes one), `residual_network` and
         `diagnosed`.
       better: 90 % interval of how much smaller the diagnosed model's error is than each other's, as
-        a share of the other's, over recordings.
+        a share of the other's, over motions.
       nn_pd_fit: error of NN-PD on what it was fitted to, before and after, rad; None without one.
     """
 

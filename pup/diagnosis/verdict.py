@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import overlap
-from pup.diagnosis.folds import scatter
+from pup.diagnosis.folds import apart, scatter
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.laws import EQUATIONS
@@ -97,7 +97,7 @@ class HeldOut:
       recordings: their ids.
       before: root mean square error of the nominal model, rad.
       after: that of the corrected one, rad.
-      interval: 90 % interval of the relative improvement, over recordings.
+      interval: 90 % interval of the relative improvement, over motions.
       per_joint: (before, after) by joint, rad.
       per_motion: (before, after) by type of motion, rad.
     """
@@ -221,15 +221,14 @@ def reaches(model: Model) -> Array:
 
 
 def held_out(measured: Measured, before: Model, after: Model, seed: int) -> HeldOut:
-    """Errors of the joints on motions left out, with an interval over recordings."""
+    """Errors of the joints on motions left out, with an interval over motions."""
     joints = measured.channel < len(measured.robot.joints)
     squares = [(measured.values - m.predicted) ** 2 for m in (before, after)]
     numbers = np.unique(measured.recording[joints])
-    sums = np.array(
-        [[s[joints & (measured.recording == n)].sum() for n in numbers] for s in squares]
-    )
+    parts = [part for members in apart(measured) if (part := joints & measured.only(members)).any()]
+    sums = np.array([[s[part].sum() for part in parts] for s in squares])
     rng = np.random.default_rng(seed)
-    draws = rng.integers(len(numbers), size=(2000, len(numbers)))
+    draws = rng.integers(len(parts), size=(2000, len(parts)))
     drawn = sums[:, draws].sum(axis=2)
     improvement = 1 - np.sqrt(drawn[1] / np.maximum(drawn[0], 1e-300))
 
