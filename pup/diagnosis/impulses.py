@@ -5,7 +5,7 @@ second. So pushes that are far enough apart share a simulation, and so do those 
 feel each other: a few replays tell the answers to all of them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.probing import coupled
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured, Noise
 from pup.physics.actuators import per_joint
@@ -21,6 +22,8 @@ from pup.physics.model import compile_model
 from pup.physics.push import WRENCH, Push
 
 Array = NDArray[np.float64]
+Limbs = Mapping[str, Sequence[tuple[int, ...]]]
+"""Channels that feel each other, by what holds the robot."""
 
 PERIOD = 0.04
 """Time between knots, s: that of the readings."""
@@ -99,11 +102,14 @@ def responses(fit: Fit, replays: Replays, noise: Noise, budget: int = BUDGET) ->
     """
     measured = replays.measured
     size = _sizes(fit, replays)
-    period = _period(measured, budget)
+    together = coupled([*replays.space.names, *fit.values])
+    supports = _supports(measured)
+    apart = {support: _limbs(measured, support, together) for support in supports}
+    period = _period(measured, apart, budget)
     memory = int(np.ceil(MEMORY / period))
     parts: list[Part] = []
-    for support, members in _supports(measured).items():
-        limbs = _limbs(measured, support)
+    for support, members in supports.items():
+        limbs = apart[support]
         answers = _simulated(fit, replays, noise, members, limbs, size, period)
         for recording in members:
             parts += _parts(measured, answers, recording, limbs, size, period)
@@ -117,13 +123,15 @@ def _supports(measured: Measured) -> dict[str, list[int]]:
     return found
 
 
-def _limbs(measured: Measured, support: str) -> list[tuple[int, ...]]:
-    """Channels that feel each other: on a fixed torso each limb is alone, a free one joins all."""
+def _limbs(measured: Measured, support: str, together: bool) -> list[tuple[int, ...]]:
+    """Channels that feel each other: a free torso joins all limbs, a supply that sags all joints."""
     robot = measured.robot
     model = compile_model(robot, support)
     joints = len(robot.joints)
     if model.floating:
         return [tuple(range(joints + WRENCH))]
+    if together:
+        return [tuple(range(joints))]
     trees: dict[int, list[int]] = {}
     for joint, name in enumerate(robot.joint_names):
         dof = int(model.compiled.joint(name).dofadr[0])
@@ -131,19 +139,19 @@ def _limbs(measured: Measured, support: str) -> list[tuple[int, ...]]:
     return [tuple(members) for members in trees.values()]
 
 
-def _period(measured: Measured, budget: int) -> float:
+def _period(measured: Measured, limbs: Limbs, budget: int) -> float:
     """Time between knots that the budget allows, s."""
     period = PERIOD
-    while _cost(measured, period) > budget and period < MEMORY / 2:
+    while _cost(measured, limbs, period) > budget and period < MEMORY / 2:
         period += PERIOD / 2
     return period
 
 
-def _cost(measured: Measured, period: float) -> float:
+def _cost(measured: Measured, limbs: Limbs, period: float) -> float:
     """Sub-steps of all simulations of pushes."""
     cost = 0.0
     for support, members in _supports(measured).items():
-        rows = max(len(limb) for limb in _limbs(measured, support)) * np.ceil(MEMORY / period)
+        rows = max(len(limb) for limb in limbs[support]) * np.ceil(MEMORY / period)
         times = (measured.recordings[i].time for i in members)
         cost += rows * sum(t[-1] - t[0] for t in times) / measured.robot.timestep
     return cost

@@ -2,10 +2,11 @@
 
 On a fixed torso limbs move apart from each other: a change at one limb leaves all others alone, but
 for rounding. Changes at different limbs then share a simulation, and each is read from its own
-limb's joints. On the ground everything moves everything, and each change has its own.
+limb's joints. On the ground everything moves everything, and each change has its own; so it has
+where limbs share a supply that sags.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from pup.recording import Recording
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
+
+COUPLING = frozenset(("voltage_sag",))
+"""Effects by which limbs feel each other on a fixed torso too."""
 
 
 def changes(
@@ -48,8 +52,15 @@ def probed(
     every = range(len(measured.recordings)) if recordings is None else recordings
     ground = [i for i in every if measured.recordings[i].support == "ground"]
     fixed = [i for i in every if i not in ground]
-    limbs = limbs_of(measured.robot, measured.recordings)
-    packs = [_packs(probes, measured.robot, limbs) if fixed else [] for _, probes in asked]
+    apart = limbs_of(measured.robot, measured.recordings)
+    limbs = [
+        np.zeros_like(apart) if coupled([*replays.space.names, *here]) else apart
+        for here, _ in asked
+    ]
+    packs = [
+        _packs(probes, measured.robot, own) if fixed else []
+        for (_, probes), own in zip(asked, limbs, strict=True)
+    ]
     calls: list[tuple[list[Row], list[int]]] = []
     if fixed:
         rows = [
@@ -68,13 +79,15 @@ def probed(
     if fixed:
         told = next(answers)
         inside = measured.only(fixed)
-        limb = limbs[measured.channel[inside]]
-        for (_, probes), packed, (base, changed) in zip(asked, packs, out, strict=True):
+        for (_, probes), own, packed, (base, changed) in zip(
+            asked, limbs, packs, out, strict=True
+        ):
+            limb = own[measured.channel[inside]]
             base[inside], told = told[0], told[1:]
             for pack in packed:
                 change, told = told[0] - base[inside], told[1:]
                 for i in pack:
-                    mine = np.isin(limb, list(_reach(probes[i], measured.robot, limbs)))
+                    mine = np.isin(limb, list(_reach(probes[i], measured.robot, own)))
                     changed[i, inside] = np.where(mine, change, 0.0)
     if ground:
         told = next(answers)
@@ -88,6 +101,11 @@ def probed(
 
 def _merged(here: Row, probes: Sequence[Row], pack: Sequence[int]) -> Row:
     return {**here, **{name: value for i in pack for name, value in probes[i].items()}}
+
+
+def coupled(columns: Iterable[str]) -> bool:
+    """Whether one of some columns puts an effect in by which limbs feel each other."""
+    return any(told is not None and told[0] in COUPLING for told in map(split_column, columns))
 
 
 def limbs_of(robot: RobotDescription, recordings: Sequence[Recording]) -> NDArray[np.int64]:
