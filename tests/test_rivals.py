@@ -18,7 +18,8 @@ from test_report import Page
 
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.report_rivals import beside, takeaway
-from pup.diagnosis.rivals import Errors, Rivals, compare
+from pup.diagnosis.residuals import LOST
+from pup.diagnosis.rivals import Errors, Rivals, _rms, compare
 from pup.diagnosis.wording import Speech
 from pup.physics.parameters import robot_space
 from pup.recording import write_recordings
@@ -232,3 +233,8 @@ def test_without_pytorch_it_is_refused_at_once(
     assert done.code == 2
     assert "--rivals" in done.err and "PyTorch" in done.err and "pup[learn]" in done.err
     assert not (tmp_path / "out").exists()
+
+
+def test_what_diverged_is_as_far_off_wherever_it_is() -> None:
+    measured = Maker(BENCH).measured
+    assert _rms(measured, np.full_like(measured.values, np.nan)) == pytest.approx(LOST)

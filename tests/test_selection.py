@@ -13,6 +13,7 @@ from pup.diagnosis.evidence import Projector, Trace
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
+from pup.diagnosis.residuals import LOST
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.starts import Tried
 from pup.robot import RobotDescription
@@ -136,6 +137,16 @@ def test_an_effect_that_was_given_up_is_looked_at_again(monkeypatch: pytest.Monk
     selector.found = tuple(traces(hypotheses(MAKER.measured), nominal.fit))
     assert FIRST.key not in {t.hypothesis.key for t in selector._traces(with_first)}
     assert FIRST.key in {t.hypothesis.key for t in selector._traces(with_rival)}
+
+
+def test_a_fold_that_diverged_is_as_far_off_wherever_it_is() -> None:
+    selector = Made({})
+    selector.folds = [[0], [1, 2]]
+    selector.replays.together = lambda asked: [
+        np.full((1, MAKER.measured.only(fold).sum()), np.nan) for _, fold in asked
+    ]
+    told = selector.predicting(replace(MAKER.model(FIRST, 1.0), predicted=np.empty(0)))
+    assert told.predicted - MAKER.measured.values == pytest.approx(LOST)
 
 
 def test_rivals_of_other_classes_are_compared_as_closely_as_the_best(

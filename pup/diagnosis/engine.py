@@ -181,7 +181,7 @@ def diagnose(
         "model": final,
         "unexplained": left,
     }
-    odd = unrepeated(measured, np.nan_to_num(replays.errors(final.fit.row())), nominal.noise, seen)
+    odd = unrepeated(measured, replays.errors(final.fit.row()), nominal.noise, seen)
     if not model.hypotheses and not left and not odd:
         return told("none", slight, **evidence)
     progress("where", 0.87)

@@ -57,7 +57,7 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
 
     Args:
       measured: the samples.
-      errors: measured minus simulated, shape (n_samples,), rad.
+      errors: measured minus simulated, shape (n_samples,), rad; NaN says nothing, here and below.
     """
     pairs = repeats(measured)
     differing = differences(measured, errors)
@@ -127,7 +127,7 @@ def _blocks(measured: Measured, errors: Array, channel: int) -> list[Array]:
     """Errors of a channel, in blocks of some time."""
     told: list[Array] = []
     for number in range(len(measured.recordings)):
-        own = (measured.recording == number) & (measured.channel == channel)
+        own = _told(measured, errors, number, channel)
         edges = np.flatnonzero(np.diff(np.floor(measured.time[own] / BLOCK))) + 1
         told += [part for part in np.split(errors[own], edges) if len(part) >= 4]
     return told
@@ -230,8 +230,7 @@ def _differences(measured: Measured, errors: Array, a: int, b: int) -> list[Diff
     """What differs between two repeats, by channel."""
     out = []
     for channel in range(measured.channels):
-        first = (measured.recording == a) & (measured.channel == channel)
-        second = (measured.recording == b) & (measured.channel == channel)
+        first, second = (_told(measured, errors, number, channel) for number in (a, b))
         if first.sum() < 5 or second.sum() < 5:
             continue
         time, other = measured.time[first], measured.time[second]
@@ -289,7 +288,7 @@ def _changes(measured: Measured, errors: Array, channel: int) -> tuple[list[Arra
     steps: list[Array] = []
     bends: list[Array] = []
     for number, recording in enumerate(measured.recordings):
-        chosen = (measured.recording == number) & (measured.channel == channel)
+        chosen = _told(measured, errors, number, channel)
         if chosen.sum() < 8:
             continue
         step = np.diff(errors[chosen])
@@ -301,6 +300,14 @@ def _changes(measured: Measured, errors: Array, channel: int) -> tuple[list[Arra
         quiet = 2 * bend[np.abs(bend) <= np.median(np.abs(bend))]
         bends += [np.diff(rest) for rest in rests] or [quiet]
     return steps, bends
+
+
+def _told(
+    measured: Measured, errors: Array, recording: int, channel: int
+) -> NDArray[np.bool_]:
+    """Which samples are of a channel in a recording, and of a simulation that had not diverged."""
+    own = (measured.recording == recording) & (measured.channel == channel)
+    return np.asarray(own & np.isfinite(errors))
 
 
 def _calm(recording: Recording, time: Array) -> NDArray[np.bool_]:

@@ -171,7 +171,7 @@ def _range(space: ParameterSpace, name: str) -> tuple[float, float]:
 
 
 def _rms(measured: Measured, simulated: Array) -> float:
-    errors = measured.values - np.where(np.isnan(simulated), LOST, simulated)
+    errors = np.where(np.isnan(simulated), LOST, measured.values - simulated)
     joints = measured.channel < len(measured.robot.joints)
     return float(np.sqrt(np.mean(errors[joints] ** 2)))
 

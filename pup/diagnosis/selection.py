@@ -367,7 +367,8 @@ class Selector:
         told = self.replays.together(list(zip(rows, self.folds, strict=True)))
         predicted = measured.values.copy()
         for inside, simulated in zip(insides, told, strict=True):
-            predicted[inside] = np.where(np.isnan(simulated[0]), LOST, simulated[0])
+            off = measured.values[inside] + LOST
+            predicted[inside] = np.where(np.isnan(simulated[0]), off, simulated[0])
         return replace(model, predicted=predicted, refits=np.array([fit.at for fit in fits]))
 
 

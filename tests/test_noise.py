@@ -1,0 +1,40 @@
+"""Noise that is told from errors of simulations of which some have diverged."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pup.diagnosis.noise import noise_floor, quiet_noise
+from pup.diagnosis.residuals import Measured, Noise
+from pup.robot import RobotDescription
+from tests.diagnoses import Maker
+from tests.diagnosis_cases import BENCH, recordings
+
+SIGMA = 0.003
+REPEATED = Measured.of(BENCH, recordings({}))
+ALONE = replace(
+    REPEATED, recordings=tuple(replace(run, repeat_of=None) for run in REPEATED.recordings)
+)
+
+
+def errors(measured: Measured) -> np.ndarray:
+    return SIGMA * np.random.default_rng(0).normal(size=len(measured.values))
+
+
+@pytest.mark.parametrize("measured", [REPEATED, ALONE], ids=["repeated", "alone"])
+@pytest.mark.parametrize("tell", [noise_floor, quiet_noise])
+@pytest.mark.parametrize("lost", [1, 4])
+def test_what_diverged_says_nothing_of_noise(
+    measured: Measured, tell: Callable[[Measured, np.ndarray], Noise], lost: int
+) -> None:
+    diverged = (measured.recording == lost) & (measured.time > 1.0)
+    told = tell(measured, np.where(diverged, np.nan, errors(measured)))
+    assert told.sigma[0] == pytest.approx(SIGMA, rel=0.25)
+
+
+def test_a_joint_that_diverged_is_as_noisy_as_the_others() -> None:
+    measured = Maker(RobotDescription.load("darwin_leg")).measured
+    told = noise_floor(measured, np.where(measured.channel == 2, np.nan, errors(measured)))
+    assert told.sigma[: len(measured.robot.joints)] == pytest.approx(SIGMA, rel=0.35)
