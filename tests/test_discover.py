@@ -1,5 +1,6 @@
 """What no known effect explains: whether there is any, its law, and the law as physics."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from terms import BENCH, SERVO, steps, with_terms
 
 from pup.diagnosis.discover import unexplained
+from pup.diagnosis.lacks import Lack
 from pup.diagnosis.selection import Selector
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import robot_space
@@ -14,6 +16,7 @@ from pup.physics.terms import TERMS, Place, column
 from pup.physics.terms.learned import FEATURES, LearnedLaw, Seen, unit, value
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
+from tests.diagnoses import Maker
 from tests.located import fitted, measured_under, replays_of
 
 PLACE = Place("joint", "servo")
@@ -110,6 +113,16 @@ def test_a_law_outside_the_library_is_found_and_predicts_other_motions() -> None
     assert told.model.held_out.sum() < 0.5 * before.held_out.sum()
     assert told.terms == (TermSpec(LearnedLaw.effect, "joint", "servo", {name: coefficient.value}),)
     assert any(name in words for words in told.laws)
+
+
+def test_only_channels_that_are_more_than_noise_tell_how_much_is_left() -> None:
+    """A few readings that are off by much may be so by chance."""
+    maker = Maker(BENCH)
+    left = maker.beyond(maker.nothing(), PLACE, None).unexplained
+    assert left is not None
+    missing = replace(left.missing, evidence=np.zeros_like(left.missing.evidence))
+    few, many = Lack(1, 3.0, 2.0, None, 0.0, 0.0), Lack(0, 0.2, 8.0, None, 0.0, 0.0)
+    assert replace(left, missing=missing, lacks=(few, many)).excess == 0.2
 
 
 def test_noise_alone_is_not_called_unknown() -> None:

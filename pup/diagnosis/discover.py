@@ -74,6 +74,11 @@ class Unexplained:
     model: Model
     terms: tuple[TermSpec, ...]
 
+    @property
+    def excess(self) -> float:
+        """Mean square beyond noise of the worst channel whose errors are more than noise."""
+        return max(lack.excess for lack in _flagged(self.lacks, self.missing))
+
 
 def unexplained(
     model: Model, selector: Selector, found: Sequence[Regime], budget: int = BUDGET
@@ -93,7 +98,7 @@ def unexplained(
     missing = explained_by(answers, fit)
     errors = unexplained_errors(model)
     lacks = lack_of_fit(measured, errors, missing, selector.noise.unsure)
-    flagged = [lack for lack in lacks if _matters(lack, missing)]
+    flagged = _flagged(lacks, missing)
     left = left_over(model, selector.noise)
     if not flagged or left <= selector.blur(model, FORM):
         return None
@@ -134,6 +139,11 @@ def _probability(model: Model, selector: Selector) -> float:
         return 1 - UNKNOWN
     explained = selector.nominal.fit.chi2 - model.fit.chi2
     return doubt(explained, left_over(model, selector.noise))
+
+
+def _flagged(lacks: Sequence[Lack], missing: MissingInput) -> list[Lack]:
+    """The channels whose errors are more than noise, and large enough to care."""
+    return [lack for lack in lacks if _matters(lack, missing)]
 
 
 def _matters(lack: Lack, missing: MissingInput) -> bool:

@@ -239,7 +239,7 @@ def _matters(
         return True
     if left is None:
         return False
-    if max(lack.excess for lack in left.lacks) > ALONE:
+    if left.excess > ALONE:
         return True
     return improves(model, shown, noise) if model.hypotheses else shown.interval[0] > 0
 
