@@ -8,6 +8,7 @@ import pytest
 from terms import BENCH, SERVO, steps, with_terms
 
 from pup.diagnosis.discover import unexplained
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.lacks import Lack
 from pup.diagnosis.selection import Selector
 from pup.physics.mujoco_batch import MujocoSimulator
@@ -17,7 +18,7 @@ from pup.physics.terms.learned import FEATURES, LearnedLaw, Seen, unit, value
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
 from tests.diagnoses import Maker
-from tests.located import fitted, measured_under, replays_of
+from tests.located import fitted, measured_under, replays_of, settled
 
 PLACE = Place("joint", "servo")
 RUN = steps(BENCH, np.zeros(1), 2.0, "bench")
@@ -113,6 +114,17 @@ def test_a_law_outside_the_library_is_found_and_predicts_other_motions() -> None
     assert told.model.held_out.sum() < 0.5 * before.held_out.sum()
     assert told.terms == (TermSpec(LearnedLaw.effect, "joint", "servo", {name: coefficient.value}),)
     assert any(name in words for words in told.laws)
+
+
+def test_what_is_no_more_than_noise_is_not_simulated_for() -> None:
+    replays = replays_of(measured_under(BENCH, {}))
+    near, noise = fitted(replays)
+    loud = replace(noise, sigma=1.2 * noise.sigma)
+    fit = settled(Fit(near.coordinates, near.at.copy()), replays, loud)
+    selector = Selector(replays, loud, (), ENOUGH, fit)
+    spent = replays.simulated
+    assert unexplained(selector.nominal, selector, ()) is None
+    assert replays.simulated == spent
 
 
 def test_only_channels_that_are_more_than_noise_tell_how_much_is_left() -> None:

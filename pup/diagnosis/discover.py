@@ -94,13 +94,14 @@ def unexplained(
     replays, fit = selector.replays, model.fit
     measured = replays.measured
     assert fit.residual is not None
+    if left_over(model, selector.noise) <= selector.blur(model, FORM):
+        return None
     answers = responses(fit, replays, selector.noise, budget)
     missing = explained_by(answers, fit)
     errors = unexplained_errors(model)
     lacks = lack_of_fit(measured, errors, missing, selector.noise.unsure)
     flagged = _flagged(lacks, missing)
-    left = left_over(model, selector.noise)
-    if not flagged or left <= selector.blur(model, FORM):
+    if not flagged:
         return None
     place, joints = _place(measured, missing, flagged)
     tried: list[Law] = []
