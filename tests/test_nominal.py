@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from pup.diagnosis import nominal
+from pup.diagnosis.document import document
 from pup.diagnosis.nominal import SPARE, Certificate, Nominal, certified
 from pup.robot import RobotDescription
 from tests.diagnoses import Maker
@@ -34,3 +35,15 @@ def test_a_fit_to_the_noise_may_have_left_a_little_of_it(
     nothing: Any = None  # what a refit would need
     done = certified(Nominal(fit, MAKER.noise, told), nothing, nothing)
     assert done.certificate.left == pytest.approx(left)
+
+
+def test_what_does_not_settle_is_not_asked_to_find_itself_again() -> None:
+    base = MAKER.nothing()
+    apart = replace(base.nominal, certificate=Certificate((1.0, 2.0), False))
+    nothing: Any = None
+    told = certified(apart, nothing, nothing)
+    assert not told.certificate.holds
+    assert document(replace(base, nominal=told), "")["certificate"] == {
+        "chi2": [1.0, 2.0],
+        "recovered": None,
+    }

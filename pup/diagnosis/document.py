@@ -47,7 +47,10 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
         "held_out": _held_out(diagnosis.held_out),
         "next_recording": diagnosis.ask.document() if diagnosis.ask else None,
         "corrected_robot": corrected,
-        "certificate": {"chi2": list(certificate.starts), "recovered": certificate.recovered},
+        "certificate": {
+            "chi2": list(certificate.starts),
+            "recovered": certificate.recovered if certificate.agree else None,
+        },
         "nominal": {n: float(v) for n, v in diagnosis.nominal.fit.values.items()},
         "samples": len(diagnosis.measured.values),
         "simulations": diagnosis.replays,

@@ -63,7 +63,7 @@ class Certificate:
       starts: chi-squared that the two best starts lead to.
       agree: whether they agree.
       recovered: largest error of a refit of its own simulation, in standard deviations; infinite
-        until that is made, see `certified`.
+        until that is made, see `certified`, and where starts do not agree.
       left: chi-squared by which that refit stops short, and starts that end near each other or near
         the noise: kinks and motions out of step catch a fit. What gains no more is no evidence.
       samples: number of samples.
@@ -146,7 +146,7 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
 
 
 def certified(nominal: Nominal, replays: Replays, rng: np.random.Generator) -> Nominal:
-    """A nominal fit with the whole of its certificate.
+    """A nominal fit with the whole of its certificate, where its starts agree: else none holds.
 
     Args:
       nominal: as `fit_nominal` leaves it.
@@ -154,6 +154,8 @@ def certified(nominal: Nominal, replays: Replays, rng: np.random.Generator) -> N
       rng: draws where refits of its own simulation start.
     """
     told, fit = nominal.certificate, nominal.fit
+    if not told.agree:
+        return nominal
     recovered, left = _refit_of_itself(fit, replays, nominal.noise, rng)
     apart, near = told.starts[1] - told.starts[0], SPARE * told.samples
     if apart < ((OTHER - 1) * fit.chi2 if _noise_like(fit) else near):

@@ -33,11 +33,15 @@ def nominal(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
 def _certificate(diagnosis: Diagnosis) -> str:
     told = diagnosis.nominal.certificate
     ends = ", ".join(f"{chi2:,.1f}" for chi2 in told.starts)
-    return (
+    text = (
         "An optimiser that stops short looks like missing physics, so the fit is checked twice. "
         f"From {counted(len(told.starts), 'start')} it ends at chi-squared {ends}: the best two "
-        f"{'agree' if told.agree else 'do not agree'}. Fitted to a simulation of itself it comes "
-        f"back to within {max(told.recovered, 0.1):.1f} standard deviations ({SELF:g} are allowed)."
+    )
+    if not told.agree:
+        return text + "do not agree."
+    return (
+        f"{text}agree. Fitted to a simulation of itself it comes back to within "
+        f"{max(told.recovered, 0.1):.1f} standard deviations ({SELF:g} are allowed)."
     )
 
 
