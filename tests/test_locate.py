@@ -1,4 +1,4 @@
-"""Where something is missing: pushes, chains of knots, the missing input, cells and splits."""
+"""Where something is missing: pushes, chains of knots, the missing input and splits."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,9 @@ from terms import BENCH, LEG, OP2, SERVO, held, with_terms
 from test_simulator import recording
 
 from pup.diagnosis.banded import Chain
-from pup.diagnosis.cells import WHOLE, error_map
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.impulses import responses
 from pup.diagnosis.locate import BAND, explained_by, missing_input
-from pup.diagnosis.regimes import Regime
 from pup.diagnosis.splits import splits
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.push import WRENCH, Push
@@ -97,19 +95,6 @@ def test_nothing_is_located_where_nothing_is_missing() -> None:
     told = missing_input(fit, replays, noise)
     assert told.evidence.max() < 5
     assert told.noise == pytest.approx(1.0, abs=0.05)
-
-
-def test_cells_stand_out_where_errors_are_and_nowhere_else() -> None:
-    measured = measured_under(LEG, {})
-    rng = np.random.default_rng(1)
-    residual = rng.normal(size=len(measured.values))
-    late = Regime("late", measured.time > 2.0)
-    quiet = error_map(measured, residual, [late])
-    assert not any(cell.significant for cell in quiet)
-    residual[late.inside & (measured.channel == 3)] *= 3
-    loud = [c for c in error_map(measured, residual, [late]) if c.significant]
-    assert {(c.channel, c.regime) for c in loud} == {("l_knee", "late"), ("l_knee", WHOLE)}
-    assert loud[-1].mean_square == pytest.approx(9, rel=0.5)
 
 
 def test_a_drift_splits_early_from_late_until_it_is_in_the_model() -> None:

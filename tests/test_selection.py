@@ -59,9 +59,7 @@ class Made(Selector):
     def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
         """With fits as good as their models."""
         ways = super()._exchanges(model, rounds)
-        return [
-            (n, (known, replace(fit, chi2=self.worths[known]))) for n, (known, fit) in ways
-        ]
+        return [(n, (known, replace(fit, chi2=self.worths[known]))) for n, (known, fit) in ways]
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +77,9 @@ class TestSwaps:
 
     found = made((FIRST, LAST), 400.0)
     rounds = (
-        chosen(made((), 1000.0), made((FIRST,), 700.0), made((RIVAL,), 705.0), made((OTHER,), 710.0)),
+        chosen(
+            made((), 1000.0), made((FIRST,), 700.0), made((RIVAL,), 705.0), made((OTHER,), 710.0)
+        ),
         chosen(made((FIRST,), 700.0), found),
     )
     worths: Worths = {(LAST, RIVAL): 300.0, (LAST, OTHER): 350.0, (LAST,): 900.0}

@@ -302,9 +302,7 @@ def _changes(measured: Measured, errors: Array, channel: int) -> tuple[list[Arra
     return steps, bends
 
 
-def _told(
-    measured: Measured, errors: Array, recording: int, channel: int
-) -> NDArray[np.bool_]:
+def _told(measured: Measured, errors: Array, recording: int, channel: int) -> NDArray[np.bool_]:
     """Which samples are of a channel in a recording, and of a simulation that had not diverged."""
     own = (measured.recording == recording) & (measured.channel == channel)
     return np.asarray(own & np.isfinite(errors))

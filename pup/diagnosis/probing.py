@@ -79,9 +79,7 @@ def probed(
     if fixed:
         told = next(answers)
         inside = measured.only(fixed)
-        for (_, probes), own, packed, (base, changed) in zip(
-            asked, limbs, packs, out, strict=True
-        ):
+        for (_, probes), own, packed, (base, changed) in zip(asked, limbs, packs, out, strict=True):
             limb = own[measured.channel[inside]]
             base[inside], told = told[0], told[1:]
             for pack in packed:

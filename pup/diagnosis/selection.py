@@ -302,9 +302,7 @@ class Selector:
         ]
         closely([*own, *close], self.replays, self.noise)
 
-    def parted(
-        self, before: Model, finalists: Sequence[Model]
-    ) -> tuple[list[Model], list[Model]]:
+    def parted(self, before: Model, finalists: Sequence[Model]) -> tuple[list[Model], list[Model]]:
         """Finalists that hold against a model, and those that do not, the best first of each."""
         ordered = sorted(finalists, key=lambda m: m.worth)
         holds = [m for m in ordered if self.holds(before, m)]
