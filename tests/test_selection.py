@@ -1,9 +1,9 @@
 """Which effects are exchanged, refitted and looked at again, on models made up of whole cloth."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ class TestSwaps:
         ),
         chosen(made((FIRST,), 700.0), found),
     )
-    worths: Worths = {(LAST, RIVAL): 300.0, (LAST, OTHER): 350.0, (LAST,): 900.0}
+    worths: ClassVar[Worths] = {(LAST, RIVAL): 300.0, (LAST, OTHER): 350.0, (LAST,): 900.0}
 
     def test_a_better_rival_takes_the_place_of_an_effect(self) -> None:
         swap = Made(self.worths)._swap(self.found, self.rounds)
@@ -104,7 +104,7 @@ class TestTheLast:
     """Of an effect that was found last, or alone, whose rivals are weighed by another noise."""
 
     found = made((FIRST,), 700.0)
-    worths: Worths = {(RIVAL,): 690.0, (OTHER,): 710.0}
+    worths: ClassVar[Worths] = {(RIVAL,): 690.0, (OTHER,): 710.0}
 
     def test_it_is_exchanged_where_a_rival_is_worth_more_by_now(self) -> None:
         rounds = [chosen(made((), 1000.0), self.found, made((RIVAL,), 695.0))]

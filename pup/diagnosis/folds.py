@@ -21,7 +21,7 @@ def folds(replays: Replays) -> list[list[int]]:
 
 
 def apart(measured: Measured) -> list[list[int]]:
-    """Recordings by motion, as one done again tells little new; by themselves, where all are one."""
+    """Recordings by motion, as one done again tells little new; each alone where all are one."""
     families = list(measured.families().values())
     return families if len(families) > 1 else [[i] for i in range(len(measured.recordings))]
 

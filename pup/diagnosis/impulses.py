@@ -124,7 +124,7 @@ def _supports(measured: Measured) -> dict[str, list[int]]:
 
 
 def _limbs(measured: Measured, support: str, together: bool) -> list[tuple[int, ...]]:
-    """Channels that feel each other: a free torso joins all limbs, a supply that sags all joints."""
+    """Channels that feel each other: a free torso joins all limbs, a sagging supply all joints."""
     robot = measured.robot
     model = compile_model(robot, support)
     joints = len(robot.joints)
