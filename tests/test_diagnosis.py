@@ -185,7 +185,7 @@ class Linear:
     """Replays of a model whose samples are linear in its parameters."""
 
     def __init__(self, matrix: np.ndarray, data: np.ndarray) -> None:
-        self.matrix, self.asked = matrix, 0
+        self.space, self.matrix, self.asked = robot_space(BENCH, "pd"), matrix, 0
         self.measured = Measured.of(BENCH, recordings({}))
         n = len(self.measured.values)
         self.matrix = np.resize(matrix, (n, matrix.shape[1]))
