@@ -1,7 +1,8 @@
 """The agent: one process that owns the robot, and what it says to those outside.
 
-The control loop is a thread that waits for nobody; this is everything else, in one loop: gateway,
-commands of this computer, emergency stop, trials, systemd.
+The control loop is a thread that waits for nobody, and so is the link to the gateway; an emergency
+stop is done by whoever hears of it. This is everything else, in one loop: what the gateway says,
+commands of this computer, trials, systemd.
 """
 
 import logging
@@ -24,7 +25,7 @@ from hardware_agent.distance import distance_of
 from hardware_agent.health import health
 from hardware_agent.journal import Journal
 from hardware_agent.link_thread import LinkThread
-from hardware_agent.motion import Motion
+from hardware_agent.motion import LATE, Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.port import BusError, BusyError
 from hardware_agent.recordings import Recordings
@@ -140,9 +141,8 @@ class Agent:
             self._close()
 
     def end(self) -> None:
-        """End the agent, from a signal or another thread."""
-        self._ending = True
-        self._bell.set()
+        """End the agent at its next turn, from a signal or another thread."""
+        self._ending = True  # no more: a signal may come while the loop holds the bell's lock
 
     def answer(self, command: dict[str, Any]) -> dict[str, Any]:
         """Do a command of this computer; called from other threads.
@@ -202,6 +202,7 @@ class Agent:
         if self._met.is_set():
             self._met.clear()
             self._send(*self._hello())
+            self._beaten = 0.0  # a hello tells no state
         while not self._heard.empty():
             self._receive(self._heard.get())
         while not self._events.empty():
@@ -213,9 +214,7 @@ class Agent:
         if not call.done.set_running_or_notify_cancel():  # who asked has been told that it is not
             return
         try:
-            if call.stops != self._stops and call.command.get("do") in MOVING:
-                raise InputError("the robot was stopped meanwhile; ask again")
-            call.done.set_result(self._command(call.command))
+            call.done.set_result(self._command(call))
         except InputError as error:
             call.done.set_exception(error)
         except Exception as error:  # a command must not end who holds the robot
@@ -252,15 +251,20 @@ class Agent:
         elif isinstance(body, Acknowledge):
             self._book.acknowledged(body)
 
-    def _command(self, command: dict[str, Any]) -> dict[str, Any] | None:
-        do = command.get("do")
+    def _command(self, call: Call) -> dict[str, Any] | None:
+        def stopped() -> bool:
+            return call.stops != self._stops
+
+        do = call.command.get("do")
+        if do in MOVING and stopped():
+            raise InputError(LATE.reason)
         if do == "enable":
             self._watch_stop()
-            refused = self._motion.enable()
+            refused = self._motion.enable(stopped)
         elif do == "disable":
             refused = self._motion.disable()
         else:
-            return self._order(command)
+            return self._order(call.command)
         if refused is not None:
             raise InputError(refused.reason)
         return {"state": str(self._motion.status.state)}

@@ -42,6 +42,7 @@ from pup.wire import AgentState, Assign, Outcome
 
 REOPEN = 1.0  # s between tries to find a bus that is gone
 PRIORITY = 20  # of the real-time scheduler
+LATE = Refused("the robot was stopped meanwhile; ask again")
 STANDSTILL = 10.0  # s, the longest wait for an answer in lock-step
 BEAT = 0.05  # s between two beats meanwhile
 STATISTICS = 33  # ticks between updates of the loop's statistics
@@ -85,9 +86,14 @@ class Motion(threading.Thread):
         self._stop_reason = brief(reason)
         self._wake.set()
 
-    def enable(self) -> Refused | None:
-        """Hold the pose that the robot is in, with full power."""
-        return self._ask(self._enable)
+    def enable(self, stopped: Callable[[], bool]) -> Refused | None:
+        """Hold the pose that the robot is in, with full power.
+
+        Args:
+          stopped: whether somebody has stopped the robot since this was asked for.
+        """
+        # Asked again where it is done: a stop may have come since, from any thread.
+        return self._ask(lambda senses: LATE if stopped() else self._enable(senses))
 
     def disable(self) -> Refused | None:
         """Let the robot go limp."""

@@ -232,27 +232,29 @@ class _Job:
         """Algorithm 1's fits, each over the bounded parameters that its recordings can see."""
         o = self.options
         drawn = draw_subsets(len(self.recordings), o.subsets, o.fraction, o.seed)
-        problems = [_seen(bounded.of(subset)) for subset in drawn]
-        fits = {}
-        for i, problem in enumerate(problems):
+        fits = []
+        for i, subset in enumerate(drawn):
+            problem = _seen(bounded.of(subset))
             at = problem.free_space.normalise(problem.free_space.nominal)
             settings = FitSettings(
                 at, NEAR_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
             )
-            if problem.free:
-                fits[i] = Fit(f"subset{i}", problem, settings)
+            fits.append(Fit(f"subset{i}", problem, settings))
         # They start from the nominal fit: another one, after more generations, makes them others.
         place = f"subsets-{_short(bounded.digest, o.fraction)}"
-        results = dict(zip(fits, self._fit("subset fits", list(fits.values()), place), strict=True))
+        results = self._fit("subset fits", fits, place)
         return tuple(
-            _subset_fit(problem, results.get(i) or _described(problem), bounded.free)
-            for i, problem in enumerate(problems)
+            _subset_fit(fit.problem, result, bounded.free)
+            for fit, result in zip(fits, results, strict=True)
         )
 
     def _fit(self, stage: str, fits: list[Fit], place: str = "") -> list[FitResult]:
+        """Make fits; where nothing can be seen, values stay what they are."""
         checkpoints = self.out / "checkpoints" / place
         checkpoints.mkdir(parents=True, exist_ok=True)
-        return self.runner.run(fits, checkpoints, lambda s: self.progress(stage, s))
+        seeing = [fit for fit in fits if fit.problem.free]
+        made = iter(self.runner.run(seeing, checkpoints, lambda s: self.progress(stage, s)))
+        return [next(made) if f.problem.free else _described(f.problem) for f in fits]
 
     def _bounds(
         self,

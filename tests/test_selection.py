@@ -91,7 +91,19 @@ class TestSwaps:
         assert swap.holding == 3
 
     def test_a_rival_that_does_not_hold_takes_none(self) -> None:
-        assert Made(self.worths, [RIVAL])._swap(self.found, self.rounds) is None
+        swap = Made(self.worths, [RIVAL])._swap(self.found, self.rounds)
+        assert swap is not None
+        assert [m.hypotheses[-1] for m in swap.finalists] == [OTHER, FIRST, RIVAL]
+        assert swap.holding == 2
+        assert Made(self.worths, [RIVAL, OTHER])._swap(self.found, self.rounds) is None
+
+    def test_a_rival_of_the_last_one_that_does_not_hold_hinders_none(self) -> None:
+        unsettled = chosen(self.found, made((FIRST, OTHER), 390.0))
+        rounds = (self.rounds[0], replace(unsettled, before=made((FIRST,), 700.0)))
+        worths = self.worths | {(FIRST, OTHER): 299.0}
+        swap = Made(worths, [OTHER])._swap(self.found, rounds)
+        assert swap is not None
+        assert swap.finalists[0].hypotheses == (LAST, RIVAL)
 
     def test_of_those_behind_only_what_holds_is_a_rival(self) -> None:
         swap = Made(self.worths, [OTHER])._swap(self.found, self.rounds)

@@ -137,20 +137,35 @@ class Selector:
         fit_together([fit for _, (_, fit) in ways], self.replays, self.noise, iterations=ROUGH)
         last = len(model.hypotheses) - 1
         closely([fit for n, (_, fit) in ways if n == last], self.replays, self.noise)
-        number, (_, best) = min(ways, key=lambda way: way[1][1].chi2)
-        margin = self.enough if number < last else 0.0
-        if best.chi2 > model.fit.chi2 - margin:
-            return None
-        same = sorted(self.models([one for n, one in ways if n == number]), key=lambda m: m.worth)
-        better = self._ended(same[0])
-        if better.worth > model.worth - margin / 2:
+        ways.sort(key=lambda way: (way[0] == last, way[1][1].chi2))
+        for number in dict.fromkeys(n for n, _ in ways):
+            rivals = [one for n, one in ways if n == number]
+            margin = self.enough if number < last else 0.0
+            if swap := self._exchanged(model, number, rivals, margin, rounds):
+                return swap
+        return None
+
+    def _exchanged(
+        self,
+        model: Model,
+        number: int,
+        rivals: Sequence[Tried],
+        margin: float,
+        rounds: Sequence[Round],
+    ) -> Round | None:
+        """One effect exchanged for the best rival that holds, where that gains a margin."""
+        if min(fit.chi2 for _, fit in rivals) > model.fit.chi2 - margin:
             return None
         before = self._less(model, number)
-        if not self.holds(before, better):
+        holds, others = self.parted(before, self.models(rivals))
+        if not holds:
+            return None
+        better = self._ended(holds[0])
+        if better.worth > model.worth - margin / 2:
             return None
         given_up = model.hypotheses[number]
         known_as = replace(model, hypotheses=(*before.hypotheses, given_up))
-        holds, others = self.parted(before, [*same[1:], known_as])
+        holds, others = self.parted(before, [*holds[1:], *others, known_as])
         ranking = chosen_in(rounds, given_up.key).ranking
         return Round(before, ranking, (better, *holds, *others), 1 + len(holds))
 
