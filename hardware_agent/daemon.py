@@ -24,6 +24,7 @@ from hardware_agent.control import ControlServer
 from hardware_agent.distance import distance_of
 from hardware_agent.health import health
 from hardware_agent.journal import Journal
+from hardware_agent.link import Link
 from hardware_agent.link_thread import LinkThread
 from hardware_agent.motion import LATE, Motion
 from hardware_agent.policies import Shelf
@@ -99,7 +100,7 @@ class Agent:
         self._met = threading.Event()  # the gateway, and it has not been told hello
         self._link: LinkThread | None = None
         if settings.link.gateway:
-            self._link = LinkThread(settings.link, self._meet, self._hear)
+            self._link = LinkThread(Link(settings.link, self._meet), self._hear)
         self._control = ControlServer(settings.socket, self.answer)
         self._stopper: subprocess.Popen[bytes] | None = None
         self._ending = False

@@ -8,7 +8,6 @@ from contextlib import suppress
 
 import zmq
 
-from hardware_agent.config import LinkSettings
 from hardware_agent.link import Link
 from pup.wire import Body, Message
 
@@ -19,23 +18,13 @@ class LinkThread(threading.Thread):
     """Has a link to itself.
 
     Args:
-      settings: of the configuration.
-      greet: told that a connection has come about, from this thread.
-      deliver: told each message, from this thread; must not block.
-
-    Raises:
-      InputError: a key cannot be read.
+      link: used, its `greet` called, and closed from this thread.
+      deliver: told each message, likewise; must not block.
     """
 
-    def __init__(
-        self,
-        settings: LinkSettings,
-        greet: Callable[[], None],
-        deliver: Callable[[Message], None],
-    ) -> None:
+    def __init__(self, link: Link, deliver: Callable[[Message], None]) -> None:
         super().__init__(name="link", daemon=True)
-        self._link = Link(settings, greet)
-        self._deliver = deliver
+        self._link, self._deliver = link, deliver
         self._out: queue.SimpleQueue[tuple[Body, ...]] = queue.SimpleQueue()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._ending = False

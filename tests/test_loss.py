@@ -102,21 +102,26 @@ def test_falls_and_stands_are_weighed_as_the_paper_has_it() -> None:
     assert loss.total(loss.terms(seen), [2]) == pytest.approx([0.0])
 
 
-@pytest.mark.parametrize("lost", [False, True])
-def test_a_lean_at_rest_is_no_error_of_what_follows(lost: bool) -> None:
-    """Eight ticks at rest, of which the first four settle, and two after a command."""
+def rested(tilt: np.ndarray) -> Recording:
+    """Eight ticks at rest and two after a command, leaning as told, shape (10, 2), rad."""
     target = np.zeros((10, 2))
     target[8:] = 0.5
-    measured = np.tile([0.04, -0.02], (10, 1))
-    stand = recorded(
+    return recorded(
         "stand",
         np.zeros((10, 2)),
-        measured,
+        tilt,
         motion="standup",
         support="ground",
         target=target,
         time=np.arange(10) / 30,
     )
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_lean_at_rest_is_no_error_of_what_follows(lost: bool) -> None:
+    """Eight ticks at rest, of which the first four settle, and two after a command."""
+    measured = np.tile([0.04, -0.02], (10, 1))
+    stand = rested(measured)
     tilt = np.full((10, 2), NAN) if lost else np.zeros((10, 2))
     tilt[0] = measured[0]
     if not lost:
@@ -129,19 +134,9 @@ def test_a_lean_at_rest_is_no_error_of_what_follows(lost: bool) -> None:
 
 def test_a_tick_without_tilt_does_not_hide_a_lean_at_rest() -> None:
     """What is known of the rest tells the lean; where nothing is known of it, nothing is said."""
-    target = np.zeros((10, 2))
-    target[8:] = 0.5
     measured = np.tile([0.04, -0.02], (10, 1))
     measured[5, 0] = measured[4:8, 1] = NAN
-    stand = recorded(
-        "stand",
-        np.zeros((10, 2)),
-        measured,
-        motion="standup",
-        support="ground",
-        target=target,
-        time=np.arange(10) / 30,
-    )
+    stand = rested(measured)
     seen = replayed((stand,), tilt=np.zeros((10, 2)))
     unknown_lean = 0.02 * 6  # of the pitch, at the ticks that have one
     assert loss_of(stand).terms(seen).tilt[0, 0] == pytest.approx(unknown_lean)
