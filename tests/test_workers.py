@@ -3,6 +3,7 @@
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,12 @@ class Once:
 
 def workers_named(name: str) -> list[psutil.Process]:
     """Processes of the embedded Ray of this process whose title begins so."""
-    return [p for p in psutil.Process().children(recursive=True) if p.name().startswith(name[:15])]
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):  # it ended since it was listed
+            if process.name().startswith(name[:15]):
+                found.append(process)
+    return found
 
 
 def kill_one(name: str) -> None:
