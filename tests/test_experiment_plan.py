@@ -45,6 +45,8 @@ REFUSED = {
     "schema = 1\n[[walk]]\ndirection = 'forward'\nmethods = ['x']": "'x' is not a valid Method",
     "schema = 1\n[[walk]]\ndirection = 'forward'\nrobots = 0": "needs a method and a robot",
     "schema = 1\n[[walk]]\ndirection = 'forward'\n[[walk]]\ndirection = 'forward'": "stands twice",
+    "schema = 1\npooled = true": "pooled: needs fixed_network in presysid",
+    "schema = 1\nseeds = [1]\npooled = true\n[presysid]\nfixed_network = true": "and two robots",
     "schema = 1\n[record]\nmotions = []": "a motion and a repeat at least",
     "seeds": "not a TOML document",
 }
@@ -117,6 +119,15 @@ def test_the_default_plan_is_that_of_the_issue() -> None:
     assert cells["presysid-fleet"].needs == {
         f"recordings {s}": f"record-r{s}" for s in Plan().seeds
     }
+
+
+def test_bounds_of_a_fleet_are_pooled_from_its_robots_fits_where_the_plan_says_so() -> None:
+    plan = replace(small(), pooled=True)
+    cells = graph(plan)
+    assert cells["presysid-fleet"].needs == {f"fit {s}": f"presysid-r{s}" for s in plan.seeds}
+    assert cells["policy-forward-pup"].needs == {"bounds": "presysid-fleet"}
+    alone = graph(replace(plan, stages=("presysid",)))
+    assert {cell.kind for cell in alone.values()} == {"record", "presysid", "pooled"}
 
 
 def test_what_does_not_matter_to_a_cell_is_not_told_it() -> None:

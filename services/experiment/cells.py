@@ -72,9 +72,9 @@ class _Graph:
     def cells(self) -> dict[str, Cell]:
         for seed in self.plan.seeds:
             self._record(seed)
-        self._presysid(FLEET, self.plan.fleet, self._recordings(self.plan.seeds))
         for seed in self.plan.seeds:
             self._presysid(f"presysid-r{seed}", self.plan.presysid, self._recordings([seed]))
+        self._fleet()
         for walk in self.plan.walks:
             for method in walk.methods:
                 self._policy(walk, method)
@@ -98,7 +98,7 @@ class _Graph:
             return "corrected"
         if cell.name.endswith("-prior") or cell.kind == "landscape":
             return "prior"
-        return cell.kind
+        return "presysid" if cell.kind == "pooled" else cell.kind
 
     def _add(self, cell: Cell) -> None:
         self._cells[cell.name] = cell
@@ -125,6 +125,14 @@ class _Graph:
         told = self._fitted(fits)
         weight = 60 + 0.3 * fits.generations * fits.population * len(needs)
         self._add(Cell(name, "presysid", dict(needs), told, self._given(), weight))
+
+    def _fleet(self) -> None:
+        """The bounds that policies are trained on."""
+        if not self.plan.pooled:
+            self._presysid(FLEET, self.plan.fleet, self._recordings(self.plan.seeds))
+            return
+        needs = {f"fit {seed}": f"presysid-r{seed}" for seed in self.plan.seeds}
+        self._add(Cell(FLEET, "pooled", needs, self._told(), self._given(), 1.0))
 
     def _fitted(self, fits: Fits) -> dict[str, Any]:
         return self._told(fits=fits.told(), motions=self.plan.record.fitted)

@@ -143,6 +143,7 @@ class Plan:
       record: what is recorded.
       presysid: budget of each robot's own fit.
       fleet: that of the fit of all robots' recordings, whose bounds policies are trained on.
+      pooled: whether these are the range of the robots' own fits instead, which costs no fit.
       train: how.
       trials: how many.
       diagnosis: from what.
@@ -162,6 +163,7 @@ class Plan:
     record: Recorded = field(default_factory=Recorded)
     presysid: Fits = field(default_factory=lambda: replace(FITS, compare=False))
     fleet: Fits = field(default_factory=lambda: replace(FITS, subsets=20, fraction=0.02))
+    pooled: bool = False
     train: Train = field(default_factory=Train)
     trials: Trials = field(default_factory=Trials)
     diagnosis: Diagnosed = field(default_factory=Diagnosed)
@@ -181,6 +183,11 @@ class Plan:
             training(words)
         if unknown := [stage for stage in self.stages if stage not in STAGES]:
             raise InputError(f"stage {unknown[0]!r} is unknown; there are {', '.join(STAGES)}")
+        if self.pooled and not (self.presysid.fixed_network and len(self.seeds) > 1):
+            raise InputError(
+                "pooled: needs fixed_network in presysid, for one network means one scale of rho "
+                "and sigma, and two robots"
+            )
         if min(self.trials.trials, self.trials.prior, self.trials.repeats) < 1:
             raise InputError("trials: trials, prior and repeats must be 1 or more")
         if self.trials.landscape < 2 or self.record.repeats < 1 or not self.record.motions:
@@ -241,7 +248,7 @@ def read_plan(file: Path) -> Plan:
     walks = table.tables("walk")
     if walks:
         told["walks"] = tuple(_walk(walk, file) for walk in walks)
-    own = _values(table, usual, ("seeds", "control", "stages", "seed"))
+    own = _values(table, usual, ("seeds", "pooled", "control", "stages", "seed"))
     table.close()
     try:
         return replace(usual, **told, **own)

@@ -167,10 +167,13 @@ def _bounds(told: Mapping[str, Any]) -> Iterator[Html]:
         "Grey: not identified by these recordings.",
     )
     histories = {name: np.array(values, float) for name, values in told["histories"].items()}
-    names = " and ".join(LABELS.get(name, name) for name in histories)
-    yield figure(
-        convergence(histories), f"Loss over generations, {names}.", f"Fit of all robots: {names}."
-    )
+    if histories:  # there are none where the fleet was not fitted as one
+        names = " and ".join(LABELS.get(name, name) for name in histories)
+        yield figure(
+            convergence(histories),
+            f"Loss over generations, {names}.",
+            f"Fit of all robots: {names}.",
+        )
     columns = [Column("Parameter"), Column("Lower", "number"), Column("Upper", "number")]
     columns += [Column("Nominal", "number"), Column("Robots inside", "number")]
     rows = [

@@ -107,7 +107,21 @@ def presysid(task: Task) -> dict[str, Any]:
     options = Options(**task.told["fits"])
     recordings = task.recordings(tuple(task.told["motions"]))
     wanted = task.simulated, recordings, options, task.out, LocalRunner()
-    told = identify(*wanted, lambda stage, statuses: None, 1).document()
+    return _bounds(identify(*wanted, lambda stage, statuses: None, 1).document())
+
+
+def pooled(task: Task) -> dict[str, Any]:
+    """Bounds of the fleet, from the fits of its robots."""
+    from pup.sysid.pooled import pooled
+
+    files = [folder / "bounds.json" for folder in task.needed.values()]
+    bounds = pooled(files, task.robot)
+    bounds.write(task.out / "bounds.json")
+    return _bounds(bounds.document())
+
+
+def _bounds(told: dict[str, Any]) -> dict[str, Any]:
+    """What a cell tells of a `bounds.json`."""
     kept = ("parameters", "actuator", "loss", "histories", "splits")
     return {name: told[name] for name in kept}
 
@@ -214,6 +228,7 @@ def diagnosis(task: Task) -> dict[str, Any]:
 KINDS: dict[str, Callable[[Task], dict[str, Any]]] = {
     "record": record,
     "presysid": presysid,
+    "pooled": pooled,
     "policy": policy,
     "landscape": landscape,
     "trials": trials,
@@ -221,6 +236,7 @@ KINDS: dict[str, Callable[[Task], dict[str, Any]]] = {
 }
 LEFT = {
     "presysid": ("bounds.json",),
+    "pooled": ("bounds.json",),
     "policy": ("policy/policy.json",),
     "landscape": ("simulated.json",),
     "diagnosis": ("diagnosis.json", "corrected/robot.toml"),
