@@ -14,7 +14,7 @@ from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.search import followed, search
+from pup.diagnosis.search import followed, in_the_air, search
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
 from tests.blind_sets import ENOUGH, FRICTION, shortened
@@ -103,6 +103,21 @@ def test_a_motion_that_gets_lost_comes_second(runs: tuple[Recording, ...]) -> No
 def test_where_too_few_are_left_all_are_taken(runs: tuple[Recording, ...]) -> None:
     lost = [replace(run, position=run.position + 1.0) for run in runs[2:]]
     assert kept((*runs[:2], *lost)) == []
+
+
+def test_where_contact_leads_astray_what_is_in_the_air_comes_first(
+    runs: tuple[Recording, ...],
+) -> None:
+    def aloft(grounded: set[int]) -> list[int]:
+        supports = ["ground" if i in grounded else run.support for i, run in enumerate(runs)]
+        told = [replace(r, support=s) for r, s in zip(runs, supports, strict=True)]
+        measured = Measured.of(BENCH, runs)
+        return in_the_air(replace(measured, recordings=tuple(told)))
+
+    assert aloft({1, 3}) == [i for i in range(len(runs)) if i not in (1, 3)]
+    assert aloft(set()) == []
+    assert aloft(set(range(len(runs)))) == []
+    assert aloft(set(range(1, len(runs)))) == []  # one motion tells little
 
 
 def test_where_nothing_more_is_looked_for_a_first_look_is_not_scored_again() -> None:

@@ -28,7 +28,7 @@ from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.search import Search, followed, search, search_on
+from pup.diagnosis.search import Search, followed, in_the_air, search, search_on
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.splits import Split, splits
 from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out, in_order
@@ -148,10 +148,12 @@ def diagnose(
 
     if poor:
         return told("undetermined", poor.reason)
-    first = _first_look(nominal, replays, rng, progress, effects)
+    first = _first_look(followed(nominal, replays), replays, rng, progress, effects)
     if first is None:
         nominal = certified(nominal, replays, rng)
-    else:
+        if not nominal.certificate.holds:
+            first = _first_look(in_the_air(measured), replays, rng, progress, effects)
+    if first is not None:
         nominal = replace(nominal, certificate=first[0].certificate)
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
@@ -245,14 +247,16 @@ def _matters(
 
 
 def _first_look(
-    nominal: Nominal,
+    kept: Sequence[int],
     replays: Replays,
     rng: np.random.Generator,
     progress: Progress,
     effects: int,
 ) -> tuple[Nominal, Search] | None:
-    """What is missing in the motions that the nominal model can follow, where it loses others."""
-    kept = followed(nominal, replays)
+    """What is missing in some of the recordings, where a fit to all of them tells little.
+
+    None where there are none of these, or their nominal fit does not converge either.
+    """
     if not kept:
         return None
     some = replays.narrowed(kept)

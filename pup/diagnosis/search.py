@@ -195,16 +195,30 @@ def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
 def followed(nominal: Nominal, replays: Replays) -> list[int]:
     """The recordings that the nominal model does not lose track of.
 
-    Empty where it loses none, or where too few are left: two types of motion, a third of all.
+    Empty where it loses none, or where too few are left for a first look.
     """
     measured = replays.measured
     errors = replays.errors(nominal.fit.row())
     errors = np.where(np.isnan(errors), np.inf, errors)
     every = range(len(measured.recordings))
     kept = [i for i in every if not _lost(measured, errors, measured.only([i]))]
+    return kept if _worth_a_look(measured, kept) else []
+
+
+def in_the_air(measured: Measured) -> list[int]:
+    """The recordings without contact, which makes a fit end in many a place.
+
+    Empty where there is no contact, or where too few are left for a first look.
+    """
+    kept = [i for i, r in enumerate(measured.recordings) if r.support != "ground"]
+    return kept if _worth_a_look(measured, kept) else []
+
+
+def _worth_a_look(measured: Measured, kept: Sequence[int]) -> bool:
+    """Whether these are some recordings, not all: a third of them, and two types of motion."""
     types = {measured.recordings[i].motion for i in kept}
-    few = len(kept) < LEFT * len(every) or len(types) < 2
-    return [] if few or len(kept) == len(every) else kept
+    count = len(measured.recordings)
+    return LEFT * count <= len(kept) < count and len(types) > 1
 
 
 def _lost(measured: Measured, errors: Array, own: NDArray[np.bool_]) -> bool:
