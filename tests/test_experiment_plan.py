@@ -45,6 +45,7 @@ REFUSED = {
     "schema = 1\n[[walk]]\ndirection = 'forward'\nmethods = ['x']": "'x' is not a valid Method",
     "schema = 1\n[[walk]]\ndirection = 'forward'\nrobots = 0": "needs a method and a robot",
     "schema = 1\n[[walk]]\ndirection = 'forward'\n[[walk]]\ndirection = 'forward'": "stands twice",
+    "schema = 1\n[diagnosis]\neffects = 0": "diagnosis: effects must be 1 or more",
     "schema = 1\npooled = true": "pooled: needs fixed_network in presysid",
     "schema = 1\nseeds = [1]\npooled = true\n[presysid]\nfixed_network = true": "and two robots",
     "schema = 1\n[record]\nmotions = []": "a motion and a repeat at least",

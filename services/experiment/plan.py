@@ -123,12 +123,14 @@ class Diagnosed:
       motions: types of motion that are looked at; none for all.
       rollouts: walks of the first trials that are looked at besides.
       seconds: of each walk, from its start.
+      effects: that are looked for at most, one after the other.
       rivals: whether NN-PD and a residual network are judged beside it.
     """
 
     motions: tuple[str, ...] = ()
     rollouts: int = 0
     seconds: float = 2.0
+    effects: int = 8
     rivals: bool = False
 
 
@@ -190,6 +192,10 @@ class Plan:
             )
         if min(self.trials.trials, self.trials.prior, self.trials.repeats) < 1:
             raise InputError("trials: trials, prior and repeats must be 1 or more")
+        if self.diagnosis.effects < 1:
+            raise InputError(
+                "diagnosis: effects must be 1 or more; to look for none, leave it out of stages"
+            )
         if self.trials.landscape < 2 or self.record.repeats < 1 or not self.record.motions:
             raise InputError("a landscape needs 2 etas, recordings a motion and a repeat at least")
 

@@ -220,6 +220,7 @@ def diagnosis(task: Task) -> dict[str, Any]:
         lambda stage, share: None,
         task.told["seed"],
         rivals=task.told["rivals"],
+        effects=task.told["effects"],
     )
     kept = ("verdict", "converged", "noise_floor", "findings", "held_out", "next_recording")
     return {name: found[name] for name in kept} | {"rivals": found.get("rivals")}
