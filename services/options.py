@@ -125,6 +125,12 @@ def budget(
         help="keep the values of robot.toml, such as a diagnosis leaves them, and look for the "
         "bounds around them",
     )
+    budget.add_argument(
+        "--fitted-to",
+        metavar="MOTION,...",
+        help="types of motion that these values were fitted to: what they cannot see, such as a "
+        "centre of mass where the robot hung, is fitted all the same; default: all",
+    )
     seed(budget)
 
 

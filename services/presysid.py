@@ -56,6 +56,8 @@ class Options:
         its torque law begin there, and what the recordings cannot see stays there.
       as_described: whether the description's values are fitted ones, such as a diagnosis leaves
         them: they stay the nominal ones, and bounds alone are sought.
+      fitted_to: types of motion that these were fitted to, none for all. What no recording of them
+        can see, such as a centre of mass where the robot hung, is fitted all the same.
     """
 
     actuator: Actuator = "nn_pd"
@@ -70,14 +72,19 @@ class Options:
     seed: int = 0
     start: Path | None = None
     as_described: bool = False
+    fitted_to: tuple[str, ...] = ()
 
-    def corrected(self) -> "Options":
+    def corrected(self, motions: tuple[str, ...] = ()) -> "Options":
         """The same for a robot that a diagnosis has corrected.
 
         Its servos are PD, as they were diagnosed: what was found is missing beside these. The
         diagnosis has fitted its values, to more than the recordings.
+
+        Args:
+          motions: types of motion that were diagnosed, none for all.
         """
-        return replace(self, actuator="pd", compare=False, folds=0, start=None, as_described=True)
+        kept = replace(self, actuator="pd", compare=False, folds=0, start=None)
+        return replace(kept, as_described=True, fitted_to=motions)
 
     def told(self) -> dict[str, Any]:
         """As files have it: a file is known by its content, wherever it lies."""
@@ -132,6 +139,14 @@ class _Job:
             )
         if options.as_described and (options.folds or options.start is not None):
             raise InputError("values that are kept as described take no folds and no start")
+        types = sorted({r.motion for r in recordings})
+        if options.fitted_to and not set(options.fitted_to).intersection(types):
+            raise InputError(
+                f"no recording of type {', '.join(options.fitted_to)}, which values were fitted to, "
+                f"tells what these can see; there are {', '.join(types)}"
+            )
+        if options.fitted_to and not options.as_described:
+            raise InputError("what values were fitted to matters where they are kept as described")
         self.robot, self.recordings, self.options = robot, recordings, options
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
         compared: tuple[Actuator, ...] = (robot.actuator, "pd") if options.compare else ()
@@ -196,7 +211,7 @@ class _Job:
     ) -> tuple[dict[Actuator, FitResult], dict[str, float] | None]:
         """The nominal fit of each torque law, and the held-out error if there are folds."""
         if self.options.as_described:
-            return {actuator: _described(problem) for actuator, problem in full.items()}, None
+            return {actuator: self._kept(problem) for actuator, problem in full.items()}, None
         kept = self._folds()
         nominal = {a: self._fit_of_all(f"nominal_{a}", p) for a, p in full.items()}
         folds = {
@@ -209,6 +224,23 @@ class _Job:
         told = zip(folds.items(), results[len(nominal) :], strict=True)
         held_out = {key: (fit.problem, result) for (key, fit), result in told}
         return fitted, self._held_out(held_out) if kept else None
+
+    def _kept(self, problem: Problem) -> FitResult:
+        """The described values, and a fit of those that what they were fitted to cannot see."""
+        motions = self.options.fitted_to
+        known = [i for i, r in enumerate(self.recordings) if r.motion in motions]
+        seen = _seen(problem.of(known)).free if known else ()
+        unseen = tuple(name for name in problem.free if name not in seen)
+        if not motions or not unseen:
+            return _described(problem)
+        part = replace(problem, free=unseen)
+        start = part.free_space.normalise(part.free_space.nominal)
+        o = self.options
+        settings = FitSettings(start, NEAR_SIGMA, o.population, o.generations, o.seed)
+        (found,) = self._fit("what was not diagnosed", [Fit("unseen", part, settings)])
+        best = problem.free_space.normalise(problem.free_space.nominal)
+        best[[problem.free.index(name) for name in unseen]] = found.best
+        return replace(found, best=best)
 
     def _fit_of_all(self, name: str, problem: Problem) -> Fit:
         o = self.options

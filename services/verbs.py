@@ -330,6 +330,7 @@ def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
         seed=options.seed,
         start=options.start,
         as_described=options.as_described,
+        fitted_to=tuple(options.fitted_to.split(",")) if options.fitted_to else (),
     )
 
 

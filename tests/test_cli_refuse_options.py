@@ -132,6 +132,14 @@ def _(place: Place) -> Made:
 OPTIONS: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
     "more folds than recordings": (("--folds", 3), ("3 folds for 2 recordings", "or 0")),
     "folds of values that are kept": (("--as-described", "--folds", 2), ("no folds",)),
+    "values fitted to what was not recorded": (
+        ("--as-described", "--fitted-to", "fall"),
+        ("no recording of type fall", "there are"),
+    ),
+    "values that are fitted anyway": (
+        ("--fitted-to", "step"),
+        ("matters where they are kept as described",),
+    ),
     "a single fold": (("--folds", 1), ("1 folds for 2 recordings", "or 0")),
     "negative generations": (("--generations", -3), ("--generations", "-3", "1 and 100000")),
     "a population of three": (("--population", 3), ("--population", "4 and 4096")),

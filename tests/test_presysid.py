@@ -115,3 +115,41 @@ def test_a_subset_that_sees_nothing_is_not_searched(
     for subset, nothing in zip(subsets, blind, strict=True):
         assert np.isnan(subset.values).all() == nothing
         assert not nothing or subset.loss == 0
+
+
+def test_what_was_not_diagnosed_is_fitted_and_the_rest_stays(
+    robot: RobotDescription, tmp_path: Path
+) -> None:
+    """A robot that hung tells nothing of the floor; one that stands does."""
+    recordings = (stepped("a", "suspended"), stepped("b", "suspended"), stepped("c", "ground"))
+    asked = Options(generations=3, subsets=2, subset_generations=1, actuator="pd")
+    job, runner = job_of(robot, recordings, tmp_path, asked.corrected(("step",)))
+    job.run()
+    fit = runner.fits["unseen"]
+    assert "ground_friction" in fit.problem.free
+    assert not [name for name in fit.problem.free if name.startswith(("kp", "kd", "tau_max"))]
+    assert fit.problem.recordings == recordings
+    job, runner = job_of(robot, recordings, tmp_path, asked.corrected())
+    job.run()
+    assert "unseen" not in runner.fits
+
+
+class Moved(Idle):
+    """A runner whose fits end a tenth further."""
+
+    def run(self, fits: Sequence[Fit], checkpoints: Path, progress: Progress) -> list[FitResult]:
+        found = super().run(fits, checkpoints, progress)
+        return [FitResult(np.clip(f.best + 0.1, 0, 1), f.loss, f.history) for f in found]
+
+
+def test_only_what_was_fitted_moves(robot: RobotDescription, tmp_path: Path) -> None:
+    recordings = (stepped("a", "suspended"), stepped("b", "ground"))
+    options = Options(generations=3, actuator="pd").corrected(("step",))
+    job = _Job(robot, recordings, options, tmp_path, Moved(), lambda *_: None, 1)
+    problem = job._problem("pd")
+    before = problem.free_space.normalise(problem.free_space.nominal)
+    after = job._kept(problem).best
+    moved = {name for name, a, b in zip(problem.free, after, before, strict=True) if a != b}
+    assert "ground_friction" in moved
+    assert not [name for name in moved if name.startswith(("kp", "kd", "tau_max", "armature"))]
+    assert len(moved) < len(problem.free)

@@ -193,7 +193,7 @@ class _Graph:
         for seed in self._seeds(walk):
             refit = f"presysid-r{seed}-corrected"
             if refit not in self._cells:
-                told = self._fitted(self.plan.presysid.corrected())
+                told = self._fitted(self.plan.presysid.corrected(self.plan.diagnosis.motions))
                 needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
                 weight = self._cells[f"presysid-r{seed}"].weight
                 self._add(Cell(refit, "presysid", needs, told, self._given(), weight))

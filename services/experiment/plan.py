@@ -17,6 +17,8 @@ LIMIT = 2**18  # bytes of a plan
 ALL = tuple(Method)
 STAGES = ("record", "presysid", "policy", "trials", "prior", "diagnosis", "corrected")
 """What can be left out; what a stage needs is done in any case."""
+NOT_SAID = ("start", "fitted_to")
+"""Of fits, what is the experiment's to say: which files, and what was diagnosed."""
 FITS = Fits(generations=100, subset_generations=50)
 
 
@@ -275,7 +277,7 @@ def _walk(table: Table, file: Path) -> Walk:
 
 def _part(table: Table, usual: Any) -> Any:
     # A plan is text that means the same everywhere: it names no files.
-    read = _values(table, usual, tuple(f.name for f in fields(usual) if f.name != "start"))
+    read = _values(table, usual, tuple(f.name for f in fields(usual) if f.name not in NOT_SAID))
     table.close()
     return replace(usual, **read)
 
