@@ -142,8 +142,8 @@ class _Job:
         types = sorted({r.motion for r in recordings})
         if options.fitted_to and not set(options.fitted_to).intersection(types):
             raise InputError(
-                f"no recording of type {', '.join(options.fitted_to)}, which values were fitted to, "
-                f"tells what these can see; there are {', '.join(types)}"
+                f"no recording of type {', '.join(options.fitted_to)} tells what values that were "
+                f"fitted to it can see; there are {', '.join(types)}"
             )
         if options.fitted_to and not options.as_described:
             raise InputError("what values were fitted to matters where they are kept as described")
