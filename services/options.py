@@ -122,14 +122,14 @@ def budget(
     budget.add_argument(
         "--as-described",
         action="store_true",
-        help="keep the values of robot.toml, such as a diagnosis leaves them, and look for the "
-        "bounds around them",
+        help="keep the values that a diagnosis fits (kp, kd, tau_max, armature, ground_friction) "
+        "as robot.toml has them, fit the others, and look for the bounds around both",
     )
     budget.add_argument(
         "--fitted-to",
         metavar="MOTION,...",
-        help="types of motion that these values were fitted to: what they cannot see, such as a "
-        "centre of mass where the robot hung, is fitted all the same; default: all",
+        help="types of motion that were diagnosed: what these cannot see, such as the floor where "
+        "the robot hung, is fitted too; default: all",
     )
     seed(budget)
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.nominal import FREE as DIAGNOSED
 from pup.errors import InputError
 from pup.files import sha256
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
@@ -54,10 +55,10 @@ class Options:
       seed: of everything random.
       start: bounds file whose fitted values stand in for those of the robot's description: fits of
         its torque law begin there, and what the recordings cannot see stays there.
-      as_described: whether the description's values are fitted ones, such as a diagnosis leaves
-        them: they stay the nominal ones, and bounds alone are sought.
-      fitted_to: types of motion that these were fitted to, none for all. What no recording of them
-        can see, such as a centre of mass where the robot hung, is fitted all the same.
+      as_described: whether the description's values are those of a diagnosis: what it fits (its
+        nominal parameters) stays. The others, such as the torso's centre of mass, are fitted.
+      fitted_to: types of motion that were diagnosed, none for all. What no recording of them can
+        see, such as the floor where the robot hung, is fitted too.
     """
 
     actuator: Actuator = "nn_pd"
@@ -77,8 +78,8 @@ class Options:
     def corrected(self, motions: tuple[str, ...] = ()) -> "Options":
         """The same for a robot that a diagnosis has corrected.
 
-        Its servos are PD, as they were diagnosed: what was found is missing beside these. The
-        diagnosis has fitted its values, to more than the recordings.
+        Its servos are PD, as they were diagnosed: what was found is missing beside these. What the
+        diagnosis has fitted, to more than the recordings, stays.
 
         Args:
           motions: types of motion that were diagnosed, none for all.
@@ -226,20 +227,21 @@ class _Job:
         return fitted, self._held_out(held_out) if kept else None
 
     def _kept(self, problem: Problem) -> FitResult:
-        """The described values, and a fit of those that what they were fitted to cannot see."""
+        """The values that a diagnosis has fitted as they are, and a fit of the others."""
         motions = self.options.fitted_to
-        known = [i for i, r in enumerate(self.recordings) if r.motion in motions]
-        seen = _seen(problem.of(known)).free if known else ()
-        unseen = tuple(name for name in problem.free if name not in seen)
-        if not motions or not unseen:
+        known = [i for i, r in enumerate(self.recordings) if not motions or r.motion in motions]
+        seen = _seen(problem.of(known)).free
+        kept = {name for name in seen if name.split("/")[0] in DIAGNOSED}
+        others = tuple(name for name in problem.free if name not in kept)
+        if not others:
             return _described(problem)
-        part = replace(problem, free=unseen)
+        part = replace(problem, free=others)
         start = part.free_space.normalise(part.free_space.nominal)
         o = self.options
         settings = FitSettings(start, NEAR_SIGMA, o.population, o.generations, o.seed)
-        (found,) = self._fit("what was not diagnosed", [Fit("unseen", part, settings)])
+        (found,) = self._fit("what was not diagnosed", [Fit("others", part, settings)])
         best = problem.free_space.normalise(problem.free_space.nominal)
-        best[[problem.free.index(name) for name in unseen]] = found.best
+        best[[problem.free.index(name) for name in others]] = found.best
         return replace(found, best=best)
 
     def _fit_of_all(self, name: str, problem: Problem) -> Fit:

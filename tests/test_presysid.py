@@ -125,13 +125,13 @@ def test_what_was_not_diagnosed_is_fitted_and_the_rest_stays(
     asked = Options(generations=3, subsets=2, subset_generations=1, actuator="pd")
     job, runner = job_of(robot, recordings, tmp_path, asked.corrected(("step",)))
     job.run()
-    fit = runner.fits["unseen"]
+    fit = runner.fits["others"]
     assert "ground_friction" in fit.problem.free
     assert not [name for name in fit.problem.free if name.startswith(("kp", "kd", "tau_max"))]
     assert fit.problem.recordings == recordings
     job, runner = job_of(robot, recordings, tmp_path, asked.corrected())
     job.run()
-    assert "unseen" not in runner.fits
+    assert "others" not in runner.fits
 
 
 class Moved(Idle):
