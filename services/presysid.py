@@ -140,6 +140,11 @@ class _Job:
             )
         if options.as_described and (options.folds or options.start is not None):
             raise InputError("values that are kept as described take no folds and no start")
+        if options.as_described and options.actuator != "pd":
+            raise InputError(
+                "values that are kept as described are a diagnosis', whose servos are PD; use "
+                "--actuator pd"
+            )
         types = sorted({r.motion for r in recordings})
         if options.fitted_to and not set(options.fitted_to).intersection(types):
             raise InputError(

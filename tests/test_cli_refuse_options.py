@@ -133,8 +133,12 @@ OPTIONS: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
     "more folds than recordings": (("--folds", 3), ("3 folds for 2 recordings", "or 0")),
     "folds of values that are kept": (("--as-described", "--folds", 2), ("no folds",)),
     "values fitted to what was not recorded": (
-        ("--as-described", "--fitted-to", "fall"),
+        ("--as-described", "--actuator", "pd", "--fitted-to", "fall"),
         ("no recording of type fall", "there are"),
+    ),
+    "a network that is kept": (
+        ("--as-described", "--actuator", "nn_pd"),
+        ("whose servos are PD; use --actuator pd",),
     ),
     "values that are fitted anyway": (
         ("--fitted-to", "step"),
