@@ -91,6 +91,8 @@ class Options:
         """As files have it: a file is known by its content, wherever it lies."""
         told = asdict(self)
         del told["start"]
+        if not self.fitted_to:  # as files have it that were written before there was such a thing
+            del told["fitted_to"]
         return told if self.start is None else told | {"start": sha256(self.start)}
 
 
