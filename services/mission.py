@@ -10,7 +10,8 @@ from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription
 from services.diagnosis import Progress as Looked
 from services.diagnosis import Where
-from services.presysid import Options, Progress
+from services.presysid import Progress
+from services.presysid_options import Options
 from workers.fits import Runner
 
 SHIPPED = "recordings"

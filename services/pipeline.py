@@ -18,7 +18,8 @@ from pup.recording_cuts import cut
 from pup.robot import RobotDescription
 from services.diagnosis import CORRECTED
 from services.mission import STEPS, TRIALS, Means, Mission
-from services.presysid import Options, identify
+from services.presysid import identify
+from services.presysid_options import Options
 from services.replay import replay
 from services.stages import Journal, Stage, content
 

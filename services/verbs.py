@@ -315,7 +315,7 @@ def _tell(line: str) -> None:
 
 
 def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
-    from services.presysid import Options
+    from services.presysid_options import Options
 
     return Options(
         actuator=options.actuator or robot.actuator,

@@ -12,7 +12,8 @@ from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid.fit import FitResult
-from services.presysid import Options, _Job
+from services.presysid import _Job
+from services.presysid_options import Options
 from workers.fits import Fit, Progress
 
 TICKS = 10

@@ -9,7 +9,8 @@ import pytest
 from pup.physics.parameters import robot_space
 from pup.robot import RobotDescription
 from pup.sysid.virtual import record
-from services.presysid import Options, identify
+from services.presysid import identify
+from services.presysid_options import Options
 from workers.fits import LocalRunner
 
 # A range from a few subsets is no confidence interval: its ends may miss a well-determined truth by

@@ -122,7 +122,7 @@ def test_a_virtual_robot_walks_for_no_other(tmp_path: Path) -> None:
     """Its walks would be diagnosed together with recordings of a robot that it knows nothing of."""
     from services.mission import Mission, default_recordings
     from services.pipeline import _Job
-    from services.presysid import Options
+    from services.presysid_options import Options
 
     def job(source: str, trials: int | None) -> _Job:
         *others, last = default_recordings(DARWIN)
@@ -141,7 +141,7 @@ def test_a_shipped_policy_is_started_from_where_there_is_one(
 ) -> None:
     from services.mission import Mission
     from services.pipeline import Half, _Job
-    from services.presysid import Options
+    from services.presysid_options import Options
 
     folder = shutil.copytree(DARWIN.folder, tmp_path / "darwin_op2")
     shutil.rmtree(folder / POLICIES, ignore_errors=True)

@@ -11,7 +11,7 @@ from pup.errors import InputError
 from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
 from pup.robot_toml import Table, read_text
-from services.presysid import Options as Fits
+from services.presysid_options import Options as Fits
 
 LIMIT = 2**18  # bytes of a plan
 ALL = tuple(Method)

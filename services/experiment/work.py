@@ -101,7 +101,8 @@ def record(task: Task) -> dict[str, Any]:
 
 def presysid(task: Task) -> dict[str, Any]:
     """Parameters and bounds of the recordings of one robot, or of all."""
-    from services.presysid import Options, identify
+    from services.presysid import identify
+    from services.presysid_options import Options
     from workers.fits import LocalRunner
 
     options = Options(**task.told["fits"])
