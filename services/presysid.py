@@ -163,24 +163,24 @@ class _Job:
     def _kept(self, problem: Problem) -> FitResult:
         """The values that a diagnosis has fitted as they are, and a fit of the others."""
         motions = self.options.fitted_to
-        known = [i for i, r in enumerate(self.recordings) if not motions or r.motion in motions]
-        seen = _seen(problem.of(known)).free
+        known = [i for i, r in enumerate(self.recordings) if r.motion in motions]
+        seen = _seen(problem.of(known)).free if motions else problem.free
         kept = {name for name in seen if name.split("/")[0] in DIAGNOSED}
         others = tuple(name for name in problem.free if name not in kept)
         if not others:
             return _described(problem)
         part = replace(problem, free=others)
-        start = part.free_space.normalise(part.free_space.nominal)
+        start = _described_at(part)
         o = self.options
         settings = FitSettings(start, NEAR_SIGMA, o.population, o.generations, o.seed)
         (found,) = self._fit("what was not diagnosed", [Fit("others", part, settings)])
-        best = problem.free_space.normalise(problem.free_space.nominal)
+        best = _described_at(problem)
         best[[problem.free.index(name) for name in others]] = found.best
         return replace(found, best=best)
 
     def _fit_of_all(self, name: str, problem: Problem) -> Fit:
         o = self.options
-        start = problem.free_space.normalise(problem.free_space.nominal)
+        start = _described_at(problem)
         sigma = NEAR_SIGMA if problem.actuator in self.known else FAR_SIGMA
         return Fit(name, problem, FitSettings(start, sigma, o.population, o.generations, o.seed))
 
@@ -203,7 +203,7 @@ class _Job:
         fits = []
         for i, subset in enumerate(drawn):
             problem = _seen(bounded.of(subset))
-            at = problem.free_space.normalise(problem.free_space.nominal)
+            at = _described_at(problem)
             settings = FitSettings(
                 at, NEAR_SIGMA, o.population, o.subset_generations, o.seed + 1 + i, anchor=at
             )
@@ -319,15 +319,20 @@ def _originals(recordings: Sequence[Recording]) -> list[tuple[str, ...]]:
     return [(r.motion, r.repeat_of or r.id) for r in recordings]
 
 
+def _described_at(problem: Problem) -> Array:
+    """The nominal values of the free parameters, on their unit cube."""
+    return problem.free_space.normalise(problem.free_space.nominal)
+
+
 def _seen(problem: Problem) -> Problem:
     """The same with those of its parameters free that its recordings can see."""
-    start = problem.free_space.normalise(problem.free_space.nominal)
+    start = _described_at(problem)
     return replace(problem, free=observable(problem, start))
 
 
 def _described(problem: Problem) -> FitResult:
     """The nominal values, as a fit would tell them that finds no better ones."""
-    start = problem.free_space.normalise(problem.free_space.nominal)
+    start = _described_at(problem)
     return FitResult(start, float(problem.losses(start[None])[0]), np.empty(0))
 
 
@@ -350,7 +355,7 @@ def _subset_fit(problem: Problem, fit: FitResult, names: Sequence[str]) -> Subse
 
 def _measured(problem: Problem, fit: FitResult) -> dict[str, float]:
     """Loss and RMSE (rad) over all recordings, where the fit begins and where it ends."""
-    before = problem.free_space.normalise(problem.free_space.nominal)
+    before = _described_at(problem)
     replayed = problem.replay(np.stack([before, fit.best]))
     losses = problem.loss.total(problem.loss.terms(replayed))
     errors = [_pooled(e) for e in problem.loss.rmse(replayed)]
