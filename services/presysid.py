@@ -5,6 +5,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
 from pup.sysid.result import Bounds, SubsetFit, read_fitted
-from pup.sysid.uncertainty import observable, spread_at
+from pup.sysid.uncertainty import Spread, observable, spread_at
 from services.presysid_options import Options
 from workers.fits import Fit, Runner, Status
 
@@ -105,9 +106,8 @@ class _Job:
 
     def run(self) -> Bounds:
         begin = time.time()
-        full = {a: self._problem(a) for a in self.actuators}
-        fitted, held_out = self._nominal(full)
-        main = full[self.options.actuator]
+        fitted, held_out = self._nominal()
+        full, main = self.full, self.full[self.options.actuator]
         best = main.values(fitted[self.options.actuator].best[None])[0]
         bounded = replace(
             main,
@@ -115,7 +115,7 @@ class _Job:
             free=tuple(n for n in _movable(main.space) if n not in NETWORK_NAMES),
         )
         subsets = self._subsets(bounded)
-        bounds = self._bounds(bounded, fitted, full, held_out, subsets, begin)
+        bounds = self._bounds(bounded, fitted, held_out, subsets, begin)
         bounds.write(self.out / "bounds.json")
         replays = {a: p.replay(fitted[a].best[None]) for a, p in full.items()}
         labels = {"nn_pd": "NN-PD", "pd": "PD"}
@@ -129,6 +129,22 @@ class _Job:
         )
         return bounds
 
+    @cached_property
+    def full(self) -> dict[Actuator, Problem]:
+        """All recordings, under each torque law."""
+        return {actuator: self._problem(actuator) for actuator in self.actuators}
+
+    @cached_property
+    def kept(self) -> frozenset[str]:
+        """The parameters that a diagnosis has fitted, and could see in what it was given."""
+        if not self.options.as_described:
+            return frozenset()
+        (problem,) = self.full.values()
+        motions = self.options.fitted_to
+        known = [i for i, r in enumerate(self.recordings) if r.motion in motions]
+        seen = _seen(problem.of(known)).free if motions else problem.free
+        return frozenset(name for name in seen if name.split("/")[0] in DIAGNOSED)
+
     def _problem(self, actuator: Actuator) -> Problem:
         """All recordings, with the parameters free that they can see."""
         known = self.known.get(actuator)
@@ -141,10 +157,9 @@ class _Job:
             raise InputError("nothing to fit: no parameter changes what the recordings measure")
         return problem
 
-    def _nominal(
-        self, full: dict[Actuator, Problem]
-    ) -> tuple[dict[Actuator, FitResult], dict[str, float] | None]:
+    def _nominal(self) -> tuple[dict[Actuator, FitResult], dict[str, float] | None]:
         """The nominal fit of each torque law, and the held-out error if there are folds."""
+        full = self.full
         if self.options.as_described:
             return {actuator: self._kept(problem) for actuator, problem in full.items()}, None
         kept = self._folds()
@@ -162,11 +177,7 @@ class _Job:
 
     def _kept(self, problem: Problem) -> FitResult:
         """The values that a diagnosis has fitted as they are, and a fit of the others."""
-        motions = self.options.fitted_to
-        known = [i for i, r in enumerate(self.recordings) if r.motion in motions]
-        seen = _seen(problem.of(known)).free if motions else problem.free
-        kept = {name for name in seen if name.split("/")[0] in DIAGNOSED}
-        others = tuple(name for name in problem.free if name not in kept)
+        others = tuple(name for name in problem.free if name not in self.kept)
         if not others:
             return _described(problem)
         part = replace(problem, free=others)
@@ -228,25 +239,22 @@ class _Job:
         self,
         bounded: Problem,
         fitted: dict[Actuator, FitResult],
-        full: dict[Actuator, Problem],
         held_out: dict[str, float] | None,
         subsets: tuple[SubsetFit, ...],
         begin: float,
     ) -> Bounds:
         space = bounded.free_space
         values = np.array([s.values for s in subsets])
-        at = space.normalise(space.nominal)
-        spread = spread_at(bounded, at, self._uncertainty)
+        spread = self._spread(bounded)
         known, together = spread.confidence(0.9), spread.together(0.95)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
-        # An interval is of a minimum, which kept values are not: it does not widen their range. It
-        # is told all the same, and by the surface: slopes alone would call parameters identified.
+        # An interval is of a minimum, which kept values are not: it does not widen their range.
         if not self.options.as_described:
             lower, upper = widened(lower, upper, (together.lower, together.upper), space)
         lower = np.where(spread.unseen, space.lower, lower)
         upper = np.where(spread.unseen, space.upper, upper)
         actuator = self.options.actuator
-        main, nominal = full[actuator], fitted[actuator]
+        main, nominal = self.full[actuator], fitted[actuator]
         phi = [n for n in bounded.space.names if n in NETWORK_NAMES]
         return Bounds(
             robot=self.robot.name,
@@ -263,10 +271,17 @@ class _Job:
             held_out=held_out,
             subsets=subsets,
             splits=self._splits(values, space, subsets),
-            histories={a: fitted[a].history for a in full},
+            histories={a: fitted[a].history for a in self.full},
             omitted=tuple(main.loss.omitted()),
             provenance=self._provenance(time.time() - begin),
         )
+
+    def _spread(self, bounded: Problem) -> Spread:
+        """What the recordings tell of the fitted values; of kept ones the diagnosis has told."""
+        fitted = tuple(name for name in bounded.free if name not in self.kept)
+        part = replace(bounded, free=fitted)
+        spread = spread_at(part, _described_at(part), self._uncertainty)
+        return spread.among(bounded.free_space)
 
     def _uncertainty(self, share: float) -> None:
         self.progress("uncertainty", [Status("replays", round(100 * share), 100, np.inf)])

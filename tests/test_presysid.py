@@ -64,7 +64,7 @@ def test_a_fold_fits_what_its_recordings_can_see(robot: RobotDescription, tmp_pa
     recordings = (stepped("air", "suspended"), stepped("floor", "ground"))
     options = Options("pd", folds=2, compare=False)
     job, runner = job_of(robot, recordings, tmp_path, options)
-    _, held_out = job._nominal({"pd": job._problem("pd")})
+    _, held_out = job._nominal()
     assert "ground_friction" in runner.fits["nominal_pd"].problem.free
     folds = [fit.problem for name, fit in runner.fits.items() if name.startswith("fold")]
     for problem in folds:
@@ -125,14 +125,20 @@ def test_what_was_not_diagnosed_is_fitted_and_the_rest_stays(
     recordings = (stepped("a", "suspended"), stepped("b", "suspended"), stepped("c", "ground"))
     asked = Options(generations=3, subsets=2, subset_generations=1, actuator="pd")
     job, runner = job_of(robot, recordings, tmp_path, asked.corrected(("step",)))
-    job.run()
+    bounds = job.run()
     fit = runner.fits["others"]
+    assert set(fit.problem.free).isdisjoint(job.kept)
+    told = dict(zip(bounds.space.names, bounds.ci90, strict=True))
+    assert told["ground_friction"][0] < told["ground_friction"][1]
+    for name, value in zip(bounds.space.names, bounds.nominal, strict=True):
+        assert name not in job.kept or (told[name] == value).all()
     assert "ground_friction" in fit.problem.free
     assert not [name for name in fit.problem.free if name.startswith(("kp", "kd", "tau_max"))]
     assert fit.problem.recordings == recordings
     job, runner = job_of(robot, recordings, tmp_path, asked.corrected())
-    job.run()
+    bounds = job.run()
     assert "others" not in runner.fits
+    assert (bounds.ci90[:, 0] == bounds.ci90[:, 1]).all() and bounds.identified.all()
 
 
 class Moved(Idle):

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
+from pup.sysid import wording
 from pup.sysid.html import Drawing
 from pup.sysid.result import Bounds
 
@@ -196,10 +197,7 @@ def correlation_matrix(bounds: Bounds) -> Drawing:
         cmap="RdBu_r", vmin=-1, vmax=1, edgecolors="white", linewidth=0.5,
     )  # fmt: skip
     middle = np.arange(count) + 0.5
-    names = [
-        f"{name}: {low:.3g} to {high:.3g}"
-        for name, (low, high) in zip(bounds.space.names, bounds.ci90, strict=True)
-    ]
+    names = [f"{name}: {wording.interval(bounds, i)}" for i, name in enumerate(bounds.space.names)]
     axes.set_yticks(middle, names, fontsize=8)
     axes.set_xticks(middle, bounds.space.names, fontsize=8, rotation=90)
     axes.invert_yaxis()

@@ -147,7 +147,7 @@ class _Report:
                 number(bounds.nominal[i]),
                 number(bounds.lower[i]),
                 number(bounds.upper[i]),
-                f"{number(bounds.ci90[i, 0])} to {number(bounds.ci90[i, 1])}",
+                wording.interval(bounds, i),
                 ("yes" if bounds.identified[i] else _NOT)
                 + ("; at the range's end" if edge else ""),
             )
@@ -166,7 +166,7 @@ class _Report:
             "and widened towards an interval that holds all parameters at once in 95 % of cases, "
             "by a twentieth of the search range at most; the whole search range where the "
             "recordings tell next to nothing. 90 % interval: how far the nominal fit is "
-            "determined if the model is right.",
+            "determined if the model is right, with values that were kept taken as known.",
         )
         if any(wording.at_edge(bounds)):
             yield tag(

@@ -46,7 +46,8 @@ class Bounds:
       nominal: their nominal fit, physical, shape (n_parameters,).
       lower: lower bounds of Algorithm 1.
       upper: upper bounds.
-      ci90: 90 % intervals of the nominal fit, shape (n_parameters, 2).
+      ci90: 90 % intervals of the nominal fit, shape (n_parameters, 2). Values that were kept are
+        taken as known: both ends are the value.
       identified: whether the recordings determine each parameter, shape (n_parameters,).
       correlation: of the bounded parameters, shape (n_parameters, n_parameters).
       weights: the network's weights, shape (27,); empty for `pd`.

@@ -83,6 +83,21 @@ class Spread:
         """Intervals that hold all parameters at once so often (Bonferroni)."""
         return self.confidence(1 - (1 - level) / len(self.space))
 
+    def among(self, space: ParameterSpace) -> "Spread":
+        """The same among parameters that were taken as known, at the space's nominal values.
+
+        Args:
+          space: with the parameters of this spread in it.
+        """
+        at = [space.names.index(name) for name in self.space.names]
+        centre = space.normalise(space.nominal)
+        covariance = np.zeros((len(space), len(space)))
+        freedom = np.full(len(space), np.inf)
+        centre[at], covariance[np.ix_(at, at)], freedom[at] = (
+            self.centre, self.covariance, self.freedom,
+        )  # fmt: skip
+        return Spread(space, centre, covariance, freedom)
+
 
 def spread_at(
     problem: Problem, unit: Array, progress: Callable[[float], None] = lambda _: None
@@ -98,6 +113,8 @@ def spread_at(
       unit: the fitted point on the unit cube, shape (n_free,).
       progress: told the share of the replays that is done.
     """
+    if not problem.free:
+        return Spread(problem.free_space, unit, np.empty((0, 0)), np.empty(0))
     on_ground = np.array([r.support == "ground" for r in problem.recordings])
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads
         told, starts = told_at(problem, unit)

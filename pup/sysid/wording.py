@@ -191,6 +191,12 @@ def strong_pairs(bounds: Bounds) -> list[str]:
     ]
 
 
+def interval(bounds: Bounds, i: int) -> str:
+    """The 90 % interval of a parameter's fit; of one that was kept there is none."""
+    low, high = bounds.ci90[i]
+    return "kept" if low == high else f"{number(low)} to {number(high)}"
+
+
 def at_edge(bounds: Bounds) -> list[bool]:
     """Whether each nominal value stands at an end of its search range, to 1 % of it."""
     unit = bounds.space.normalise(bounds.nominal)
