@@ -14,7 +14,7 @@ from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
 from services.arguments import parser
 from services.experiment.cells import chosen, graph
-from services.experiment.plan import STAGES, Plan, Train, Walk, read_plan, small, training
+from services.experiment.plan import STAGES, Plan, Walk, read_plan, small, training
 
 DOCUMENTED = Path(__file__).parents[1] / "docs" / "experiment.md"
 
@@ -113,10 +113,11 @@ def test_the_default_plan_is_that_of_the_issue() -> None:
     for direction, methods, robots in (("forward", 4, 10), ("backward", 2, 4), ("sideways", 2, 4)):
         arms = {n.split("-", 3)[3] for n in walked if f"-{direction}-" in n}
         searched = methods - 2 if methods == 4 else methods - 1
-        assert len(arms) == methods + searched + 2  # priors, the corrected and its control
+        # All again where the fleet is diagnosed, priors, the corrected and its control.
+        assert len(arms) == 2 * methods + searched + 2
         assert sum(n.endswith(f"-{direction}-pup") for n in walked) == robots
     trained = [n for n in cells if n.startswith("policy-") and not n.startswith("policy-r1")]
-    assert len(trained) == 8
+    assert len(trained) == 16
     assert cells["presysid-fleet"].needs == {
         f"recordings {s}": f"record-r{s}" for s in Plan().seeds
     }
@@ -131,14 +132,30 @@ def test_bounds_of_a_fleet_are_pooled_from_its_robots_fits_where_the_plan_says_s
     assert {cell.kind for cell in alone.values()} == {"record", "presysid", "pooled"}
 
 
+def test_a_diagnosed_fleet_is_what_its_corrected_robots_share() -> None:
+    cells = graph(replace(small(), stages=("diagnosed",)))
+    fleet = "presysid-fleet-diagnosed"
+    assert cells[fleet].needs == {f"fit {s}": f"presysid-r{s}-corrected" for s in (1000, 1001)} | {
+        f"robot {s}": f"diagnosis-r{s}" for s in (1000, 1001)
+    }
+    start = {"bounds": fleet, "robot": fleet, "start": "policy-forward-robust"}
+    assert cells["policy-forward-robust-diagnosed"].needs == start
+    walked = cells["trials-r1001-forward-pup-diagnosed"]
+    own = {"bounds": "presysid-r1001-corrected", "robot": "diagnosis-r1001"}
+    assert walked.needs == {"policy": "policy-forward-pup-diagnosed"} | own
+    assert not {n for n in cells if n.startswith("trials-") and not n.endswith("-diagnosed")}
+    alone = graph(replace(small(), seeds=(1000,), stages=("diagnosed",)))
+    assert not alone  # one robot shares nothing
+
+
 def test_what_does_not_matter_to_a_cell_is_not_told_it() -> None:
     """Other trials change no recording, fit or policy; another training changes no fit."""
     first = graph(small())
     trials = graph(replace(small(), trials=replace(small().trials, trials=4)))
     changed = {n for n in first if first[n].told != trials[n].told}
-    ends = ("-pup", "-up", "-own", "-corrected")
+    ends = ("-pup", "-up", "-own", "-corrected", "-pup-diagnosed", "-up-diagnosed")
     assert changed == {n for n in first if n.startswith("trials-") and n.endswith(ends)}
-    longer = replace(small(), train=Train("--steps 2000", small().train.further))
+    longer = replace(small(), train=replace(small().train, fleet="--steps 2000"))
     changed = {n for n in first if first[n].told != graph(longer)[n].told}
     assert changed == {f"policy-forward-{m}" for m in Method}
 

@@ -160,6 +160,7 @@ def test_what_fails_is_told_and_tried_again_and_all_else_is_done(
     workshop.fails = {"diagnosis-r1001"}
     failed = do(cells, tmp_path)
     behind = {n for n in cells if "r1001" in n and "corrected" in n}
+    behind |= {n for n in cells if n.endswith("-diagnosed")}  # of all robots
     assert set(failed) == {"diagnosis-r1001"} | behind
     assert failed["diagnosis-r1001"] == "InputError: it cannot be done"
     assert failed["presysid-r1001-corrected"] == "needs diagnosis-r1001"
@@ -230,8 +231,11 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert ratios["pup / robust"]["value"] == pytest.approx(means["pup"] / means["robust"])
     assert ratios["pup / robust"]["ci90"][0] < 1.2 / 0.7 < ratios["pup / robust"]["ci90"][1]
     assert forward["statistics"]["above"]["robust and nominal"]["value"] >= 0.8
+    assert forward["statistics"]["above"]["robust and nominal+diagnosed"]["robots"] == 10
+    assert ratios["diagnosed / fleet"]["value"] == pytest.approx(experiments.FURTHER, rel=0.15)
     lines = {line["line"]: line for line in document["acceptance"]}
     assert lines["forward: PUP by Nominal"]["holds"]
+    assert lines["forward, diagnosed fleet: PUP by Nominal"]["holds"]
     assert lines["error held out is lower by (median)"]["value"] == pytest.approx(0.55)
     assert not [name for name in lines if "sideways: PUP by Nominal" in name]
     named = document["diagnosis"]["robots"]
@@ -242,7 +246,7 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert not {"b", "script", "link"} & {name for name, _ in page.elements}
     assert "needs <b>presysid</b>" in page.text and "stopped by overload: <b>" in page.text
     images = [attributes["src"] for name, attributes in page.elements if name == "img"]
-    assert len(images) == 16 and all(i.startswith("data:image/svg+xml") for i in images)
+    assert len(images) == 19 and all(i.startswith("data:image/svg+xml") for i in images)
     assert estimated(ratios["pup / robust"]) in page.text
 
 

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from pup.errors import InputError
 from pup.files import read_json
 from pup.robot import RobotDescription
-from pup.sysid.pooled import pooled
+from pup.robot_parts import TermSpec
+from pup.robot_writer import write_corrected
+from pup.sysid.pooled import pooled, shared_terms
 from pup.sysid.result import read_bounds
 
 DARWIN = RobotDescription.load("darwin_op2")
@@ -70,6 +72,49 @@ def test_order_does_not_matter_and_nobody_is_left_out(
     assert max(knees) <= bounds.upper[column]
     assert np.all((bounds.lower >= bounds.space.lower) & (bounds.upper <= bounds.space.upper))
     assert np.all(np.abs(bounds.correlation) <= 1 + 1e-9)
+
+
+def corrected(folder: Path, *terms: TermSpec) -> RobotDescription:
+    return write_corrected(DARWIN, folder, {}, terms, actuator="nn_pd")
+
+
+def friction(torque: float) -> TermSpec:
+    return TermSpec("coulomb_friction", "robot", "", {"torque": torque})
+
+
+def law(name: str, factor: float) -> TermSpec:
+    return TermSpec("learned_law", "robot", "", {name: factor})
+
+
+def test_what_corrected_robots_share_is_bounded_too(tmp_path: Path) -> None:
+    """The law of one robot is its own; of a friction that one robot lacks the others tell."""
+    robots = [
+        corrected(tmp_path / "a", friction(0.04), law("u", 0.1)),
+        corrected(tmp_path / "b", friction(0.08), law("v", 0.2)),
+        corrected(tmp_path / "c", friction(0.05)),
+        corrected(tmp_path / "d"),
+    ]
+    terms = shared_terms(robots)
+    assert terms == (friction(0.05),)
+    fleet = corrected(tmp_path / "fleet", *terms)
+    files = fits(tmp_path / "fits", [{"torso_com/x": x} for x in (0.0, 0.01, 0.02, 0.03)])
+    bounds = pooled(files, fleet, robots)
+    column = bounds.space.names.index("coulomb_friction/torque@robot")
+    assert bounds.nominal[column] == 0.05
+    assert bounds.lower[column] == pytest.approx(0.04 - 0.004)
+    assert bounds.upper[column] == pytest.approx(0.08 + 0.004)
+    assert np.isfinite(bounds.correlation).all() and np.isfinite(bounds.ci90).all()
+    assert np.isnan(bounds.subsets[3].values[column])
+    bounds.write(tmp_path / "bounds.json")
+    read = read_bounds(tmp_path / "bounds.json", fleet)
+    assert read.names == bounds.space.names
+    assert read.space.select(["coulomb_friction/torque@robot"]).nominal == 0.05
+
+
+def test_what_few_robots_have_is_not_shared(tmp_path: Path) -> None:
+    robots = [corrected(tmp_path / "a", friction(0.04))]
+    robots += [corrected(tmp_path / name) for name in "bc"]
+    assert shared_terms(robots) == ()
 
 
 def test_what_cannot_be_pooled_is_refused(tmp_path: Path) -> None:

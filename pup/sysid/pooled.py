@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import read_json, sha256
-from pup.physics.parameters import NETWORK_NAMES
-from pup.robot import RobotDescription
+from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
+from pup.physics.terms import TERMS, described, split_column
+from pup.robot import RobotDescription, TermSpec
+from pup.robot_parts import PlaceKind
 from pup.sysid.bounds import expanded_range
 from pup.sysid.result import Bounds, SubsetFit, read_bounds
 
@@ -20,7 +22,27 @@ SHARE = 0.9
 """Of the robots, what `ci90` of a fleet's bounds holds."""
 
 
-def pooled(files: Sequence[Path], robot: RobotDescription) -> Bounds:
+def shared_terms(robots: Sequence[RobotDescription]) -> tuple[TermSpec, ...]:
+    """What was missing in at least half of the corrected robots of a fleet, in the median of them.
+
+    A law that was learned for one robot is that robot's alone.
+    """
+    found: dict[tuple[str, PlaceKind, str], list[Array]] = {}
+    for term in (term for robot in robots for term in robot.terms if term.effect in TERMS):
+        place = term.effect, term.kind, term.name
+        found.setdefault(place, []).append(described(term).nominal)
+    shared = []
+    for (effect, kind, name), told in found.items():
+        if 2 * len(told) >= len(robots):
+            quantities = (quantity.name for quantity in TERMS[effect].quantities)
+            values = map(float, np.median(told, axis=0))
+            shared.append(TermSpec(effect, kind, name, dict(zip(quantities, values, strict=True))))
+    return tuple(shared)
+
+
+def pooled(
+    files: Sequence[Path], robot: RobotDescription, corrected: Sequence[RobotDescription] = ()
+) -> Bounds:
     """Bounds that hold the fits of several robots of one kind.
 
     What random subsets of one robot's recordings are to that robot, its robots are to a fleet: the
@@ -30,11 +52,14 @@ def pooled(files: Sequence[Path], robot: RobotDescription) -> Bounds:
     Args:
       files: a `bounds.json` of each robot. Their networks must be the same: with weights of its own
         a robot's rho and sigma mean something else.
-      robot: what the robots are built after.
+      robot: what the robots are built after. The quantities of its terms are bounded too: they are
+        what its corrected robots share.
+      corrected: the robot that each file is of, where a diagnosis has corrected them one by one.
 
     Returns:
-      The bounds. `ci90` holds the middle 90 % of the robots, `identified` what the recordings of
-      any of them determine, `correlation` is over the robots, `loss` the mean of theirs.
+      The bounds. A robot in which a term is not missing does not count for its quantities. `ci90`
+      holds the middle 90 % of the robots, `identified` what the recordings of any of them
+      determine, `correlation` is over the robots, `loss` the mean of theirs.
 
     Raises:
       InputError: there are fewer than two, one is no bounds file of this robot, or their torque
@@ -42,7 +67,8 @@ def pooled(files: Sequence[Path], robot: RobotDescription) -> Bounds:
     """
     if len(files) < 2:
         raise InputError(f"bounds of a fleet need fits of two robots at least, not {len(files)}")
-    fits = [read_bounds(file, robot) for file in files]
+    robots = corrected or [robot] * len(files)
+    fits = [read_bounds(file, one) for file, one in zip(files, robots, strict=True)]
     first = fits[0]
     weights = [name for name in first.space.names if name in NETWORK_NAMES]
     network = first.space.select(weights).nominal
@@ -53,9 +79,11 @@ def pooled(files: Sequence[Path], robot: RobotDescription) -> Bounds:
             raise InputError(
                 f"{file}: another network than in {files[0]}; fit robots with fixed_network"
             )
-    values = np.array([fit.space.select(fit.names).nominal for fit in fits])
-    space = first.space.select(first.names)
-    middle = np.median(values, axis=0)
+    whole = robot_space(robot, first.actuator)
+    bounded = (*first.names, *(n for n in whole.names if split_column(n) is not None))
+    values = np.array([_told(fit.space, bounded) for fit in fits])
+    space = whole.select(bounded)
+    middle = np.nanmedian(values, axis=0)
     lower, upper = expanded_range(values, space)
     documents = [read_json(file) for file in files]
     told = [
@@ -69,8 +97,8 @@ def pooled(files: Sequence[Path], robot: RobotDescription) -> Bounds:
         nominal=middle,
         lower=lower,
         upper=upper,
-        ci90=np.quantile(values, ((1 - SHARE) / 2, (1 + SHARE) / 2), axis=0).T,
-        identified=np.array([any(one[name] for one in told) for name in space.names]),
+        ci90=np.nanquantile(values, ((1 - SHARE) / 2, (1 + SHARE) / 2), axis=0).T,
+        identified=np.array([any(one.get(name, True) for one in told) for name in bounded]),
         correlation=_correlation(values),
         weights=network,
         train={name: float(np.mean([t[name] for t in trained])) for name in ("loss", "rmse")},
@@ -83,9 +111,15 @@ def pooled(files: Sequence[Path], robot: RobotDescription) -> Bounds:
     )
 
 
+def _told(space: ParameterSpace, names: Sequence[str]) -> Array:
+    """The fitted values of a robot, NaN for what it has not, shape (len(names),)."""
+    told = dict(zip(space.names, space.nominal, strict=True))
+    return np.array([told.get(name, np.nan) for name in names])
+
+
 def _correlation(values: Array) -> Array:
     """Of parameters over robots, shape (n_robots, n_parameters); 0 where no two robots differ."""
-    away = values - values.mean(axis=0)
+    away = np.nan_to_num(values - np.nanmean(values, axis=0))
     length = np.linalg.norm(away, axis=0)
     unit = away / np.where(length > 0, length, 1.0)
     found = unit.T @ unit

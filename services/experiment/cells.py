@@ -13,6 +13,7 @@ from pup.robot import RobotDescription
 from services.experiment.plan import Fits, Plan, Walk, training
 
 FLEET = "presysid-fleet"
+DIAGNOSED = "presysid-fleet-diagnosed"
 SEARCHED = (Method.PUP, Method.UP)
 """Methods whose policies are conditioned on something that trials can choose."""
 
@@ -84,6 +85,7 @@ class _Graph:
         for walk in self.plan.walks:
             if Method.PUP in walk.methods:
                 self._corrected(walk)
+        self._diagnosed()
         if self.real is not None:
             self._real(self.real)
         done = (*self.plan.stages, "real")
@@ -94,6 +96,8 @@ class _Graph:
         """Which stage a cell belongs to."""
         if cell.name.endswith("-real"):
             return "real"
+        if cell.name.endswith("-diagnosed"):
+            return "diagnosed"
         if "corrected" in cell.name or cell.name.endswith("-own"):
             return "corrected"
         if cell.name.endswith("-prior") or cell.kind == "landscape":
@@ -187,18 +191,45 @@ class _Graph:
         told = self._told(**asdict(plan))
         self._add(Cell(f"diagnosis-r{seed}", "diagnosis", needs, told, self._given(), 300.0))
 
+    def _refit(self, seed: int) -> dict[str, str]:
+        """The bounds of a corrected robot, and that robot."""
+        refit, robot = f"presysid-r{seed}-corrected", f"diagnosis-r{seed}"
+        if refit not in self._cells:
+            told = self._fitted(self.plan.presysid.corrected(self.plan.diagnosis.motions))
+            needs = self._recordings([seed]) | {"robot": robot}
+            weight = self._cells[f"presysid-r{seed}"].weight
+            self._add(Cell(refit, "presysid", needs, told, self._given(), weight))
+        return {"bounds": refit, "robot": robot}
+
+    def _diagnosed(self) -> None:
+        """The fleet's policies trained on where it is simulated with what its robots share."""
+        if len(self.plan.seeds) < 2:
+            return
+        refits = {seed: self._refit(seed) for seed in self.plan.seeds}
+        needs = {f"fit {seed}": refit["bounds"] for seed, refit in refits.items()}
+        needs |= {f"robot {seed}": refit["robot"] for seed, refit in refits.items()}
+        self._add(Cell(DIAGNOSED, "pooled", needs, self._told(), self._given(), 1.0))
+        words = self.plan.train.diagnosed
+        for walk in self.plan.walks:
+            for method in walk.methods:
+                first = f"policy-{walk.direction}-{method}"
+                needs = {"bounds": DIAGNOSED, "robot": DIAGNOSED, "start": first}
+                told = self._told(method=method, direction=walk.direction, training=words)
+                weight = 20 + training(words).steps / 5000
+                policy = f"{first}-diagnosed"
+                self._add(Cell(policy, "policy", needs, told, self._given(), weight))
+                for seed in self._seeds(walk):
+                    name, needs = f"trials-r{seed}-{walk.direction}-{method}", {"policy": policy}
+                    searched = method in SEARCHED
+                    needs |= refits[seed] if searched else {}
+                    count = self.plan.trials.trials if searched else 1
+                    self._walked(f"{name}-diagnosed", seed, count, needs)
+
     def _corrected(self, walk: Walk) -> None:
         """The fleet's policy trained on for each robot, in its corrected simulator and its own."""
         policy = f"policy-{walk.direction}-{Method.PUP}"
         for seed in self._seeds(walk):
-            refit = f"presysid-r{seed}-corrected"
-            if refit not in self._cells:
-                told = self._fitted(self.plan.presysid.corrected(self.plan.diagnosis.motions))
-                needs = self._recordings([seed]) | {"robot": f"diagnosis-r{seed}"}
-                weight = self._cells[f"presysid-r{seed}"].weight
-                self._add(Cell(refit, "presysid", needs, told, self._given(), weight))
-            own = {"bounds": f"presysid-r{seed}"}
-            corrected = {"bounds": refit, "robot": f"diagnosis-r{seed}"}
+            own, corrected = {"bounds": f"presysid-r{seed}"}, self._refit(seed)
             ways = {"corrected": corrected} | ({"own": own} if self.plan.control else {})
             for way, needs in ways.items():
                 self._further(walk, seed, way, needs | {"start": policy})

@@ -41,10 +41,16 @@ NAMES = {
     "pup+corrected": "PUP trained on + BO, corrected",
     "pup+own+fitted": "PUP trained on, own simulator, no trials",
     "pup+corrected+fitted": "PUP trained on, corrected, no trials",
+    "pup+diagnosed": "PUP + BO, diagnosed fleet",
+    "up+diagnosed": "UP + BO, diagnosed fleet",
+    "robust+diagnosed": "Robust, diagnosed fleet",
+    "nominal+diagnosed": "Nominal, diagnosed fleet",
+    "pup+diagnosed+fitted": "PUP, diagnosed fleet, no trials",
+    "up+diagnosed+fitted": "UP, diagnosed fleet, no trials",
 }
 """What arms are called where people read."""
 METHODS = tuple(COLOURS)
-FURTHER = {"own": PURPLE, "corrected": GREEN}
+FURTHER = {"own": PURPLE, "corrected": GREEN, "diagnosed": BLUE}
 """Colours of policies that were trained on."""
 QUANTITIES = {"distance": "distance, m", "time": "time before the fall, s"}
 
@@ -85,13 +91,14 @@ def _spread(at: float, wide: float, count: int) -> np.ndarray:
     return at + (np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)) * wide
 
 
-def per_robot(walks: Mapping[str, Any]) -> Drawing:
+def per_robot(walks: Mapping[str, Any], fleet: str = "") -> Drawing:
     """Each method's mean distance on each robot, a row for each.
 
     Args:
       walks: of one direction, by arm and robot.
+      fleet: `+diagnosed` for policies that were trained on with what diagnoses share.
     """
-    arms = [method for method in METHODS if method in walks]
+    arms = [method + fleet for method in METHODS if method + fleet in walks]
     robots = sorted({robot for arm in arms for robot in walks[arm]})
     figure = new_figure(WIDTH + 0.4, 1.1 + 0.24 * len(robots))
     axes = figure.subplots()
@@ -103,13 +110,14 @@ def per_robot(walks: Mapping[str, Any]) -> Drawing:
         ]
         at = np.array([row for row, _ in rows]) + 0.14 * (arms.index(arm) - (len(arms) - 1) / 2)
         axes.errorbar(
-            middle, at, xerr=spread, fmt="o", ms=4, lw=0.9, color=COLOURS[arm], label=NAMES[arm]
-        )
+            middle, at, xerr=spread, fmt="o", ms=4, lw=0.9, color=COLOURS[arm.removesuffix(fleet)],
+            label=NAMES[arm],
+        )  # fmt: skip
     _rows(axes, robots)
     axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
     axes.set_xlabel("distance, m (bars: deviation of the walks)")
     axes.grid(axis="x")
-    figure.legend(loc="outside upper left", ncols=4, fontsize=8)
+    figure.legend(loc="outside upper left", ncols=2 if fleet else 4, fontsize=8)
     return as_svg(figure)
 
 

@@ -16,6 +16,7 @@ SCHEMA = 1
 FURTHER = ("own", "corrected")
 PRIOR = "-prior"
 FITTED = "+fitted"
+DIAGNOSED = "diagnosed"
 
 
 def gather(
@@ -72,7 +73,8 @@ def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, An
 
     An arm is a method, whose eta was chosen by trials, with what is different: `+prior` where the
     search began with simulated rollouts, `+own` and `+corrected` where the policy was trained on in
-    a simulator of this robot, `+fitted` where eta is that of the fitted parameters, without trials.
+    a simulator of this robot, `+diagnosed` in one of the fleet with what its diagnoses share,
+    `+fitted` where eta is that of the fitted parameters, without trials.
     """
     walks: dict[str, Any] = {}
     searches: dict[str, Any] = {}
@@ -80,6 +82,7 @@ def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, An
         start = f"trials-r{seed}-{walk.direction}-"
         named = {str(m): f"{start}{m}" for m in walk.methods}
         named |= {f"{m}+prior": f"{start}{m}{PRIOR}" for m in walk.methods}
+        named |= {f"{m}+{DIAGNOSED}": f"{start}{m}-{DIAGNOSED}" for m in walk.methods}
         named |= {f"{Method.PUP}+{way}": f"{start}{way}" for way in FURTHER}
         for arm, name in named.items():
             if name not in found:

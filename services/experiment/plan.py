@@ -15,7 +15,9 @@ from services.presysid_options import Options as Fits
 
 LIMIT = 2**18  # bytes of a plan
 ALL = tuple(Method)
-STAGES = ("record", "presysid", "policy", "trials", "prior", "diagnosis", "corrected")
+STAGES = (
+    *("record", "presysid", "policy", "trials", "prior", "diagnosis", "corrected", "diagnosed"),
+)
 """What can be left out; what a stage needs is done in any case."""
 NOT_SAID = ("start", "fitted_to")
 """Of fits, what is the experiment's to say: which files, and what was diagnosed."""
@@ -63,10 +65,12 @@ class Train:
     Attributes:
       fleet: each policy, on the bounds of the fleet.
       further: what is trained on for one robot; the usual rate would undo a gait.
+      diagnosed: what is trained on for the fleet with what its diagnoses share.
     """
 
     fleet: str = ""
     further: str = "--steps 800000 --learning-rate 2e-4"
+    diagnosed: str = "--steps 3000000 --learning-rate 2e-4"
 
 
 class _Refusing(argparse.ArgumentParser):
@@ -183,7 +187,7 @@ class Plan:
             raise InputError("walk: a direction stands twice; name each once")
         if any(not walk.methods or walk.robots < 1 for walk in self.walks):
             raise InputError("walk: needs a method and a robot at least")
-        for words in (self.train.fleet, self.train.further):
+        for words in asdict(self.train).values():
             training(words)
         if unknown := [stage for stage in self.stages if stage not in STAGES]:
             raise InputError(f"stage {unknown[0]!r} is unknown; there are {', '.join(STAGES)}")
@@ -233,7 +237,7 @@ def small() -> Plan:
         record=Recorded(("step:0.3", "standup:2"), fitted=("step",)),
         presysid=replace(fits, compare=False),
         fleet=fits,
-        train=Train(least, least),
+        train=Train(least, least, least),
         trials=Trials(trials=3, prior=2, repeats=2, horizon=2.0, landscape=4),
         diagnosis=Diagnosed(motions=("step",)),
     )

@@ -116,10 +116,12 @@ def _direction(part: Mapping[str, Any]) -> Iterator[Html]:
         if (arm := told["arms"].get(key)) is not None
     ]
     yield table("Walks: mean over robots, with the deviation of all walks", columns, rows)
-    if any(method in part["walks"] for method in figures.METHODS):
-        yield figure(
-            figures.per_robot(part["walks"]), "Mean distance of each method on each robot."
-        )
+    for fleet, words in (("", ""), ("+diagnosed", ", trained on with what diagnoses share")):
+        if any(method + fleet in part["walks"] for method in figures.METHODS):
+            yield figure(
+                figures.per_robot(part["walks"], fleet),
+                f"Mean distance of each method on each robot{words}.",
+            )
     rows = [(f"farther than {name}", estimated(one)) for name, one in told["above"].items()]
     rows += [(name, estimated(one)) for name, one in told["ratios"].items()]
     if rows:

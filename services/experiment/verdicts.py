@@ -19,14 +19,19 @@ ENOUGH = 0.95
 """Share of the distance after all trials that counts as as far."""
 PUP = "pup"
 RIVALS = ("robust", "nominal", "up")
+DIAGNOSED = "+diagnosed"
+"""Arms whose policies were trained on with what the fleet's diagnoses share."""
+FLEETS = ("", DIAGNOSED)
 RATIOS = {
-    **{f"{PUP} / {rival}": (PUP, rival) for rival in RIVALS},
+    **{f"{PUP}{x} / {rival}{x}": (PUP + x, rival + x) for x in FLEETS for rival in RIVALS},
     "prior / trials": (f"{PUP}+prior", PUP),
     "trials / no trials": (PUP, f"{PUP}+fitted"),
     "corrected / fleet, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+fitted"),
     "own / fleet, no trials": (f"{PUP}+own+fitted", f"{PUP}+fitted"),
     "corrected / own, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+own+fitted"),
     "corrected / fleet": (f"{PUP}+corrected", PUP),
+    "diagnosed / fleet, no trials": (f"{PUP}{DIAGNOSED}+fitted", f"{PUP}+fitted"),
+    "diagnosed / fleet": (f"{PUP}{DIAGNOSED}", PUP),
 }
 """Means that are compared, over the robots that have both."""
 
@@ -40,16 +45,13 @@ def of_direction(part: Mapping[str, Any], seed: int) -> dict[str, Any]:
 
     Returns:
       `arms`, the mean distance (m) and time (s) of each with the deviation of all walks; `above`,
-      the share of robots on which PUP comes farther; `ratios` of means; `needed`, trials until a
-      walk came as far as 95 % of what PUP comes after all trials.
+      the share of robots on which PUP comes farther than what was trained where it was; `ratios` of
+      means; `needed`, trials until a walk came as far as 95 % of what PUP comes after all trials.
     """
     walks = part["walks"]
-    above = {rival: _above(walks, [rival], seed) for rival in RIVALS if rival in walks}
-    if "robust" in walks and "nominal" in walks:
-        above["robust and nominal"] = _above(walks, ["robust", "nominal"], seed)
     return {
         "arms": {arm: _arm(told, seed) for arm, told in walks.items()},
-        "above": above,
+        "above": _above(walks, "", seed) | _above(walks, DIAGNOSED, seed),
         "ratios": {
             name: estimate(ratio, _means(walks, pair), seed).document()
             for name, pair in RATIOS.items()
@@ -65,10 +67,15 @@ def _means(walks: Mapping[str, Any], arms: Sequence[str]) -> list[list[float]]:
     return [[float(np.mean(walks[arm][r]["distance"])) for arm in arms] for r in robots]
 
 
-def _above(walks: Mapping[str, Any], rivals: Sequence[str], seed: int) -> dict[str, Any]:
-    if PUP not in walks:
-        return estimate(share_above, []).document()
-    return estimate(share_above, _means(walks, [PUP, *rivals]), seed).document()
+def _above(walks: Mapping[str, Any], fleet: str, seed: int) -> dict[str, Any]:
+    """On which share of the robots PUP comes farther than its rivals, each and two together."""
+    rivals = {rival + fleet: [rival + fleet] for rival in RIVALS if rival + fleet in walks}
+    both = [f"robust{fleet}", f"nominal{fleet}"]
+    if rivals.keys() >= set(both):
+        rivals[f"robust and nominal{fleet}"] = both
+    first = PUP + fleet
+    rows = {n: _means(walks, [first, *r]) if first in walks else [] for n, r in rivals.items()}
+    return {name: estimate(share_above, told, seed).document() for name, told in rows.items()}
 
 
 def _arm(told: Mapping[str, Any], seed: int) -> dict[str, Any]:
@@ -109,19 +116,27 @@ def acceptance(directions: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> l
     """What was to be shown, and whether it was: a line for each bar."""
     lines = []
     for direction, part in directions.items():
-        told = part["statistics"]
-        above, ratios = told["above"], told["ratios"]
-        both = above.get("robust and nominal") or above.get("robust")
+        above, ratios = part["statistics"]["above"], part["statistics"]["ratios"]
+        for x, fleet in (("", direction), (DIAGNOSED, f"{direction}, diagnosed fleet")):
+            both = above.get(f"robust and nominal{x}") or above.get(f"robust{x}")
+            by = {rival: ratios.get(f"{PUP}{x} / {rival}{x}") for rival in ("robust", "nominal")}
+            lines += [
+                _line(f"{fleet}: robots on which PUP comes farther than its rivals", both, 0.8),
+                _line(f"{fleet}: PUP by Robust", by["robust"], 1.5),
+                _line(f"{fleet}: PUP by Nominal", by["nominal"], 2.0),
+            ]
         lines += [
-            _line(f"{direction}: robots on which PUP comes farther than its rivals", both, 0.8),
-            _line(f"{direction}: PUP by Robust", ratios.get("pup / robust"), 1.5),
-            _line(f"{direction}: PUP by Nominal", ratios.get("pup / nominal"), 2.0),
             _line(
                 f"{direction}: few trials with a prior by all", ratios.get("prior / trials"), 0.95
             ),
             _line(
                 f"{direction}: no trials, corrected simulator by the fleet's",
                 ratios.get("corrected / fleet, no trials"),
+                1.3,
+            ),
+            _line(
+                f"{direction}: no trials, diagnosed fleet by the fleet",
+                ratios.get("diagnosed / fleet, no trials"),
                 1.3,
             ),
         ]

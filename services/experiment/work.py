@@ -22,6 +22,7 @@ from services.experiment.cells import Cell
 RESULT = "result.json"
 """What a cell found, the same whenever and wherever it is done."""
 CORRECTED = "corrected"
+SHARED = "What was missing in at least half of a fleet's robots, in the median of them."
 
 
 @dataclass(frozen=True)
@@ -112,11 +113,17 @@ def presysid(task: Task) -> dict[str, Any]:
 
 
 def pooled(task: Task) -> dict[str, Any]:
-    """Bounds of the fleet, from the fits of its robots."""
-    from pup.sysid.pooled import pooled
+    """Bounds of the fleet, from the fits of its robots; of corrected ones, with what they share."""
+    from pup.robot_writer import write_corrected
+    from pup.sysid.pooled import pooled, shared_terms
 
-    files = [folder / "bounds.json" for folder in task.needed.values()]
-    bounds = pooled(files, task.robot)
+    files = [f / "bounds.json" for part, f in task.needed.items() if part.startswith("fit ")]
+    folders = [f / CORRECTED for part, f in task.needed.items() if part.startswith("robot ")]
+    corrected, robot = [RobotDescription.load(str(folder)) for folder in folders], task.robot
+    if corrected:
+        terms = shared_terms(corrected)
+        robot = write_corrected(robot, task.out / CORRECTED, {}, terms, SHARED)
+    bounds = pooled(files, robot, corrected)
     bounds.write(task.out / "bounds.json")
     return _bounds(bounds.document())
 
