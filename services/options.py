@@ -114,6 +114,11 @@ def budget(
         "--fixed-network", action="store_true", help="keep the robot's network weights"
     )
     budget.add_argument(
+        "--imu",
+        action="store_true",
+        help="fit how the IMU sits and how late it tells beside the model",
+    )
+    budget.add_argument(
         "--start",
         type=Path,
         metavar="FILE",

@@ -21,6 +21,7 @@ from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
 from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range, widened
 from pup.sysid.fit import FitResult, FitSettings
+from pup.sysid.imu import imu_names, with_imu
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
 from pup.sysid.result import Bounds, SubsetFit, read_fitted
@@ -152,6 +153,9 @@ class _Job:
         free = tuple(
             n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
         )
+        if self.options.imu:
+            described, space = space, with_imu(space)
+            free += space.names[len(described) :]
         problem = _seen(Problem(self.robot, self.recordings, actuator, space, free, self.threads))
         if not problem.free:
             raise InputError("nothing to fit: no parameter changes what the recordings measure")
@@ -267,6 +271,7 @@ class _Job:
             identified=known.identified,
             correlation=known.correlation,
             weights=bounded.space.select(phi).nominal,
+            imu=bounded.space.select([n for n in main.free if n in imu_names(bounded.space)]),
             train=_measured(main, nominal),
             held_out=held_out,
             subsets=subsets,

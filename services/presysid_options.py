@@ -33,6 +33,7 @@ class Options:
         nominal parameters) stays. The others, such as the torso's centre of mass, are fitted.
       fitted_to: types of motion that were diagnosed, none for all. What no recording of them can
         see, such as the floor where the robot hung, is fitted too.
+      imu: whether how the IMU sits and how late it tells is fitted beside.
     """
 
     actuator: Actuator = "nn_pd"
@@ -48,6 +49,7 @@ class Options:
     start: Path | None = None
     as_described: bool = False
     fitted_to: tuple[str, ...] = ()
+    imu: bool = False
 
     def corrected(self, motions: tuple[str, ...] = ()) -> "Options":
         """The same for a robot that a diagnosis has corrected.
@@ -59,14 +61,15 @@ class Options:
           motions: types of motion that were diagnosed, none for all.
         """
         kept = replace(self, actuator="pd", compare=False, folds=0, start=None)
-        return replace(kept, as_described=True, fitted_to=motions)
+        return replace(kept, as_described=True, fitted_to=motions, imu=True)
 
     def told(self) -> dict[str, Any]:
         """As files have it: a file is known by its content, wherever it lies."""
         told = asdict(self)
         del told["start"]
-        if not self.fitted_to:  # as files have it that were written before there was such a thing
-            del told["fitted_to"]
+        for name in ("fitted_to", "imu"):
+            if not told[name]:  # as files have it that were written before there was such a thing
+                del told[name]
         return told if self.start is None else told | {"start": sha256(self.start)}
 
     def check(self, recordings: Sequence[Recording]) -> None:

@@ -331,6 +331,7 @@ def _budget(options: argparse.Namespace, robot: RobotDescription) -> Any:
         start=options.start,
         as_described=options.as_described,
         fitted_to=tuple(options.fitted_to.split(",")) if options.fitted_to else (),
+        imu=options.imu,
     )
 
 

@@ -127,6 +127,7 @@ def make_bounds(robot: RobotDescription, recordings: tuple[Recording, ...]) -> B
         identified=identified,
         correlation=correlation,
         weights=np.zeros(27),
+        imu=space.select(()),
         train={"loss": 1.2, "rmse": 0.0401, "rmse_before": 0.0912},
         held_out={"loss": 1.5, "rmse": 0.0522, "folds": 3},
         subsets=tuple(

@@ -138,6 +138,7 @@ def test_sliding_joints_are_told_in_millimetres(tmp_path: Path) -> None:
         identified=np.ones(count, dtype=bool),
         correlation=np.eye(count),
         weights=np.empty(0),
+        imu=space.select(()),
         train={"loss": 1.0, "rmse": 0.0123},
         held_out=None,
         subsets=(),

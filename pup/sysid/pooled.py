@@ -101,6 +101,7 @@ def pooled(
         identified=np.array([any(one.get(name, True) for one in told) for name in bounded]),
         correlation=_correlation(values),
         weights=network,
+        imu=space.select(()),
         train={name: float(np.mean([t[name] for t in trained])) for name in ("loss", "rmse")},
         held_out=None,
         subsets=tuple(map(_subset, documents, values)),

@@ -168,6 +168,8 @@ class _Report:
             "recordings tell next to nothing. 90 % interval: how far the nominal fit is "
             "determined if the model is right, with values that were kept taken as known.",
         )
+        if len(bounds.imu):
+            yield tag("p", "Fitted beside, of the IMU: ", wording.imu_words(bounds), ".")
         if any(wording.at_edge(bounds)):
             yield tag(
                 "p",

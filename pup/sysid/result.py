@@ -51,6 +51,8 @@ class Bounds:
       identified: whether the recordings determine each parameter, shape (n_parameters,).
       correlation: of the bounded parameters, shape (n_parameters, n_parameters).
       weights: the network's weights, shape (27,); empty for `pd`.
+      imu: what was fitted of how the IMU sits and how late it tells, with its values as the nominal
+        ones; empty where it was taken to be as described.
       train: measures of the nominal fit on the recordings it saw: `loss`, `rmse`.
       held_out: the same on recordings left out, or None.
       subsets: the subset fits.
@@ -70,6 +72,7 @@ class Bounds:
     identified: NDArray[np.bool_]
     correlation: Array
     weights: Array
+    imu: ParameterSpace
     train: dict[str, float]
     held_out: dict[str, float] | None
     subsets: tuple[SubsetFit, ...]
@@ -89,6 +92,12 @@ class Bounds:
             "robot": self.robot,
             "parameters": [self._parameter(i) for i in range(len(self.space))],
             "actuator": {"kind": self.actuator, "weights": self.weights.tolist()},
+            "imu": [
+                {"name": name, "unit": unit, "nominal": float(value)}
+                for name, unit, value in zip(
+                    self.imu.names, self.imu.units, self.imu.nominal, strict=True
+                )
+            ],
             "loss": {"train": self.train, "held_out": self.held_out},
             "subsets": [
                 {

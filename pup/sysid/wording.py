@@ -197,6 +197,18 @@ def interval(bounds: Bounds, i: int) -> str:
     return "kept" if low == high else f"{number(low)} to {number(high)}"
 
 
+def imu_words(bounds: Bounds) -> str:
+    """How the IMU was found to sit, and how late it tells."""
+    told = zip(bounds.imu.names, bounds.imu.units, bounds.imu.nominal, strict=True)
+    plain = str.maketrans({"_": " ", "/": " in "})
+    return listed(
+        [
+            f"{name.partition('@')[0].translate(plain)} {1e3 * value:.1f} m{unit}"
+            for name, unit, value in told
+        ]
+    )
+
+
 def at_edge(bounds: Bounds) -> list[bool]:
     """Whether each nominal value stands at an end of its search range, to 1 % of it."""
     unit = bounds.space.normalise(bounds.nominal)
