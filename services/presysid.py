@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.nominal import FREE as DIAGNOSED
+from pup.diagnosis.nominal import FREE as FITTED_BY_DIAGNOSIS
 from pup.errors import InputError
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
@@ -86,7 +86,8 @@ class _Job:
         options.check(recordings)
         self.robot, self.recordings, self.options = robot, recordings, options
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
-        compared: tuple[Actuator, ...] = (robot.actuator, "pd") if options.compare else ()
+        compare = options.compare and not options.as_described  # a diagnosis knows one law
+        compared: tuple[Actuator, ...] = (robot.actuator, "pd") if compare else ()
         self.actuators = tuple(dict.fromkeys((options.actuator, *compared)))
         self.told = options.told()  # now: the file may change
         self.known = {} if options.start is None else self._begin(options.start)
@@ -140,11 +141,11 @@ class _Job:
         """The parameters that a diagnosis has fitted, and could see in what it was given."""
         if not self.options.as_described:
             return frozenset()
-        (problem,) = self.full.values()
+        problem = self.full[self.options.actuator]
         motions = self.options.fitted_to
         known = [i for i, r in enumerate(self.recordings) if r.motion in motions]
         seen = _seen(problem.of(known)).free if motions else problem.free
-        return frozenset(name for name in seen if name.split("/")[0] in DIAGNOSED)
+        return frozenset(name for name in seen if name.split("/")[0] in FITTED_BY_DIAGNOSIS)
 
     def _problem(self, actuator: Actuator) -> Problem:
         """All recordings, with the parameters free that they can see."""
@@ -154,8 +155,8 @@ class _Job:
             n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
         )
         if self.options.imu:
-            described, space = space, with_imu(space)
-            free += space.names[len(described) :]
+            space, described = with_imu(space), robot_space(self.robot, actuator).names
+            free += tuple(name for name in imu_names(space) if name not in described)
         problem = _seen(Problem(self.robot, self.recordings, actuator, space, free, self.threads))
         if not problem.free:
             raise InputError("nothing to fit: no parameter changes what the recordings measure")
@@ -166,18 +167,18 @@ class _Job:
         full = self.full
         if self.options.as_described:
             return {actuator: self._kept(problem) for actuator, problem in full.items()}, None
-        kept = self._folds()
+        folds = self._folds()
         nominal = {a: self._fit_of_all(f"nominal_{a}", p) for a, p in full.items()}
-        folds = {
-            (a, k): self._fit_of_all(f"fold{k}of{len(kept)}_{a}", _seen(p.of(chosen)))
+        left_out = {
+            (a, k): self._fit_of_all(f"fold{k}of{len(folds)}_{a}", _seen(p.of(chosen)))
             for a, p in full.items()
-            for k, chosen in enumerate(kept)
+            for k, chosen in enumerate(folds)
         }
-        results = self._fit("nominal fits", [*nominal.values(), *folds.values()])
+        results = self._fit("nominal fits", [*nominal.values(), *left_out.values()])
         fitted = dict(zip(nominal, results[: len(nominal)], strict=True))
-        told = zip(folds.items(), results[len(nominal) :], strict=True)
+        told = zip(left_out.items(), results[len(nominal) :], strict=True)
         held_out = {key: (fit.problem, result) for (key, fit), result in told}
-        return fitted, self._held_out(held_out) if kept else None
+        return fitted, self._held_out(held_out) if folds else None
 
     def _kept(self, problem: Problem) -> FitResult:
         """The values that a diagnosis has fitted as they are, and a fit of the others."""
@@ -271,7 +272,7 @@ class _Job:
             identified=known.identified,
             correlation=known.correlation,
             weights=bounded.space.select(phi).nominal,
-            imu=bounded.space.select([n for n in main.free if n in imu_names(bounded.space)]),
+            imu=bounded.space.select(self._imu()),
             train=_measured(main, nominal),
             held_out=held_out,
             subsets=subsets,
@@ -284,9 +285,14 @@ class _Job:
     def _spread(self, bounded: Problem) -> Spread:
         """What the recordings tell of the fitted values; of kept ones the diagnosis has told."""
         fitted = tuple(name for name in bounded.free if name not in self.kept)
-        part = replace(bounded, free=fitted)
+        part = replace(bounded, free=(*fitted, *self._imu()))
         spread = spread_at(part, _described_at(part), self._uncertainty)
         return spread.among(bounded.free_space)
+
+    def _imu(self) -> tuple[str, ...]:
+        """What was fitted of the IMU."""
+        seen = self.full[self.options.actuator]
+        return tuple(name for name in seen.free if name in imu_names(seen.space))
 
     def _uncertainty(self, share: float) -> None:
         self.progress("uncertainty", [Status("replays", round(100 * share), 100, np.inf)])

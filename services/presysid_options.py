@@ -55,7 +55,8 @@ class Options:
         """The same for a robot that a diagnosis has corrected.
 
         Its servos are PD, as they were diagnosed: what was found is missing beside these. What the
-        diagnosis has fitted, to more than the recordings, stays.
+        diagnosis has fitted, to more than the recordings, stays. How the IMU sits is fitted too: it
+        is in no fit before, and would move the torso's centre of mass.
 
         Args:
           motions: types of motion that were diagnosed, none for all.

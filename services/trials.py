@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
+from pup.physics.terms import split_column
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import FittedBounds, read_bounds
@@ -139,13 +140,17 @@ def follow(
 def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]:
     """The projection of the fitted parameters, shape (n_eta,).
 
+    An effect that the fitted model has not is one of size zero.
+
     Raises:
       InputError: the policy knows parameters that the fitted model does not have.
     """
-    card, names = policy.card, bounds.space.names
-    if unknown := [name for name in card.parameters if name not in names]:
+    card = policy.card
+    told = {name: 0.0 for name in card.parameters if split_column(name) is not None}
+    told |= dict(zip(bounds.space.names, map(float, bounds.space.nominal), strict=True))
+    if unknown := [name for name in card.parameters if name not in told]:
         raise InputError(f"the policy is of a model with {unknown[0]!r}, which the fitted has not")
-    mu = bounds.space.nominal[[names.index(name) for name in card.parameters]]
+    mu = np.array([told[name] for name in card.parameters])
     return policy.project(card.scale.unit(mu))
 
 

@@ -10,9 +10,9 @@ from services.experiment.cells import Cell
 
 DARWIN = RobotDescription.load("darwin_op2")
 MEANS = {"pup": 1.2, "up": 1.0, "robust": 0.7, "nominal": 0.4, "corrected": 1.4, "own": 1.25}
+"""How far each arm comes in the mean, m."""
 FURTHER = 1.1
 """By how much more where it was trained on with what diagnoses share."""
-"""How far each arm comes in the mean, m."""
 
 
 def result(cell: Cell) -> dict[str, Any]:

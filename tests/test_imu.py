@@ -14,6 +14,9 @@ from pup.robot_writer import write_corrected
 from pup.sysid import wording
 from pup.sysid.excitation import script
 from pup.sysid.imu import imu_names, with_imu
+from pup.sysid.problem import Problem
+from pup.sysid.result import read_fitted
+from pup.sysid.uncertainty import spread_at
 from pup.sysid.virtual import record_virtual
 from services.presysid import _Job
 from services.presysid_options import Options
@@ -64,6 +67,36 @@ def test_it_is_found_and_the_centre_of_mass_with_it(
     assert abs(beside["torso_com/x"] - COM) < 0.003
     assert abs(beside["torso_com/x"] - COM) < abs(without["torso_com/x"] - COM)
     assert beside["loss"] < 0.5 * without["loss"]
+
+
+def test_replays_know_how_it_sits(recordings: tuple[Recording, ...], tmp_path: Path) -> None:
+    """What is fitted beside it is of a robot whose IMU sits so, whoever reads the bounds."""
+    options = Options(generations=1, subsets=2, subset_generations=1, actuator="pd")
+    short = tuple(replace_ticks(one, 12) for one in recordings)
+    job = _Job(
+        DARWIN, short, options.corrected(("step",)), tmp_path, LocalRunner(), lambda *_: None, 1
+    )
+    bounds = job.run()
+    assert len(bounds.imu) == 4 and bounds.imu.nominal.any()
+    kind, space = read_fitted(tmp_path / "bounds.json", DARWIN)
+    read = Problem(DARWIN, short, kind, space, ())
+    assert read.losses(np.empty((1, 0)))[0] == pytest.approx(bounds.train["loss"])
+    # How it sits is not known, and so is not what hangs on it.
+    alone = replace(job.full["pd"], space=space, free=("torso_com/x",))
+    known = spread_at(alone, alone.free_space.normalise(alone.free_space.nominal)).confidence(0.9)
+    at = bounds.space.names.index("torso_com/x")
+    assert np.diff(bounds.ci90[at]) > known.upper - known.lower
+
+
+def replace_ticks(recording: Recording, ticks: int) -> Recording:
+    """Its beginning."""
+    return replace(
+        recording,
+        time=recording.time[:ticks],
+        target=recording.target[:ticks],
+        position=recording.position[:ticks],
+        extras={name: values[:ticks] for name, values in recording.extras.items()},
+    )
 
 
 def test_in_the_air_there_is_nothing_to_find(

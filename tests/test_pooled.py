@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import agents
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,11 +12,13 @@ from hypothesis import strategies as st
 
 from pup.errors import InputError
 from pup.files import read_json
+from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
 from pup.robot_parts import TermSpec
 from pup.robot_writer import write_corrected
 from pup.sysid.pooled import pooled, shared_terms
 from pup.sysid.result import read_bounds
+from services.trials import fitted_eta
 
 DARWIN = RobotDescription.load("darwin_op2")
 
@@ -78,8 +81,9 @@ def corrected(folder: Path, *terms: TermSpec) -> RobotDescription:
     return write_corrected(DARWIN, folder, {}, terms, actuator="nn_pd")
 
 
-def friction(torque: float) -> TermSpec:
-    return TermSpec("coulomb_friction", "robot", "", {"torque": torque})
+def friction(torque: float, name: str = "") -> TermSpec:
+    values = {"torque": torque, "deflection": 0.004}
+    return TermSpec("presliding_hysteresis", "joint" if name else "robot", name, values)
 
 
 def law(name: str, factor: float) -> TermSpec:
@@ -87,34 +91,47 @@ def law(name: str, factor: float) -> TermSpec:
 
 
 def test_what_corrected_robots_share_is_bounded_too(tmp_path: Path) -> None:
-    """The law of one robot is its own; of a friction that one robot lacks the others tell."""
+    """The law of one robot is its own, and so is what acts at one joint."""
     robots = [
         corrected(tmp_path / "a", friction(0.04), law("u", 0.1)),
-        corrected(tmp_path / "b", friction(0.08), law("v", 0.2)),
-        corrected(tmp_path / "c", friction(0.05)),
-        corrected(tmp_path / "d"),
+        corrected(tmp_path / "b", friction(0.08), law("v", 0.2), friction(0.3, "l_knee")),
+        corrected(tmp_path / "c", friction(0.05), friction(0.2, "l_knee")),
+        corrected(tmp_path / "d", friction(0.3, "l_knee")),
     ]
-    terms = shared_terms(robots)
+    terms = shared_terms(robots, DARWIN)
     assert terms == (friction(0.05),)
-    fleet = corrected(tmp_path / "fleet", *terms)
     files = fits(tmp_path / "fits", [{"torso_com/x": x} for x in (0.0, 0.01, 0.02, 0.03)])
-    bounds = pooled(files, fleet, robots)
-    column = bounds.space.names.index("coulomb_friction/torque@robot")
-    assert bounds.nominal[column] == 0.05
-    assert bounds.lower[column] == pytest.approx(0.04 - 0.004)
-    assert bounds.upper[column] == pytest.approx(0.08 + 0.004)
-    assert np.isfinite(bounds.correlation).all() and np.isfinite(bounds.ci90).all()
-    assert np.isnan(bounds.subsets[3].values[column])
+    bounds = pooled(files, DARWIN, robots, terms)
+    name = "presliding_hysteresis/torque@robot"
+    assert [n for n in bounds.space.names if "@" in n] == [name]  # its deflection is a shape
+    column = bounds.space.names.index(name)
+    # Where it is not missing it is of size zero.
+    assert [subset.values[column] for subset in bounds.subsets] == [0.04, 0.08, 0.05, 0.0]
+    assert bounds.nominal[column] == pytest.approx(0.045)
+    assert bounds.lower[column] == 0.0 and bounds.upper[column] == pytest.approx(0.088)
     bounds.write(tmp_path / "bounds.json")
+    fleet = corrected(tmp_path / "fleet", *terms)
     read = read_bounds(tmp_path / "bounds.json", fleet)
     assert read.names == bounds.space.names
-    assert read.space.select(["coulomb_friction/torque@robot"]).nominal == 0.05
+    assert read.space.select([name]).nominal == bounds.nominal[column]
 
 
-def test_what_few_robots_have_is_not_shared(tmp_path: Path) -> None:
-    robots = [corrected(tmp_path / "a", friction(0.04))]
-    robots += [corrected(tmp_path / name) for name in "bc"]
-    assert shared_terms(robots) == ()
+def test_what_few_robots_lack_is_not_shared(tmp_path: Path) -> None:
+    robots = [corrected(tmp_path / "a", friction(0.04)), corrected(tmp_path / "b")]
+    assert shared_terms(robots, DARWIN) == ()
+    assert shared_terms(robots[:1], robots[0]) == ()  # its own terms are not missing
+
+
+def test_values_outside_of_the_search_range_are_held_too(tmp_path: Path) -> None:
+    """Of corrected robots, whose ranges a diagnosis has widened."""
+    robots = [
+        write_corrected(DARWIN, tmp_path / name, {"rho/knee": knee}, (), actuator="nn_pd")
+        for name, knee in (("a", 1.0), ("b", 99.0))
+    ]
+    files = fits(tmp_path / "fits", [{"rho/knee": 1.0}, {"rho/knee": 99.0}])
+    bounds = pooled(files, DARWIN, robots)
+    knee = bounds.space.names.index("rho/knee")
+    assert bounds.upper[knee] == 99.0 and bounds.lower[knee] <= 1.0
 
 
 def test_what_cannot_be_pooled_is_refused(tmp_path: Path) -> None:
@@ -129,3 +146,15 @@ def test_what_cannot_be_pooled_is_refused(tmp_path: Path) -> None:
     files = fits(tmp_path, [{}, {}])
     with pytest.raises(InputError, match=r"1\.json: of another torque law or other parameters"):
         pooled([files[0], changed(files[1], parameters=told["parameters"][1:])], DARWIN)
+
+
+def test_an_effect_that_a_robot_has_not_is_one_of_size_zero(tmp_path: Path) -> None:
+    fitted = read_bounds(DARWIN.identified_path, DARWIN)
+    names = (*fitted.names, "presliding_hysteresis/torque@robot")
+    agents.bundle(tmp_path, parameters=names, lively=True)
+    policy = NumpyPolicy.load(tmp_path, DARWIN)
+    mu = np.append(fitted.space.select(fitted.names).nominal, 0.0)
+    assert np.array_equal(fitted_eta(policy, fitted), policy.project(policy.card.scale.unit(mu)))
+    agents.bundle(tmp_path, parameters=("rho/knee", "rho/tail"))
+    with pytest.raises(InputError, match="of a model with 'rho/tail', which the fitted has not"):
+        fitted_eta(NumpyPolicy.load(tmp_path, DARWIN), fitted)

@@ -55,10 +55,13 @@ class ParameterSampler:
         return np.clip(drawn, self._lowest, self._highest)
 
     def largest(self) -> Candidates:
-        """All of the robot's parameters, no smaller than any that will be drawn; one row."""
+        """All of the robot's parameters, in size no smaller than any drawn; one row."""
         if self.mu is not None:
-            return self.candidates(self.unit(np.atleast_2d(self.mu).max(axis=0))[None])
-        return self.candidates(self._highest[None])
+            told = np.atleast_2d(self.mu)
+        else:
+            told = self.physical(np.stack([self._highest, self._lowest]))
+        largest = told[np.abs(told).argmax(axis=0), np.arange(told.shape[1])]
+        return self.candidates(self.unit(largest)[None])
 
     def unit(self, mu: Array) -> Array:
         """Physical values on the unit scale of the bounds, shape (..., n_parameters)."""

@@ -12,6 +12,7 @@ from pup.files import read_json, write_json
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.robot import Actuator, RobotDescription
 from pup.sysid.bounds import Split
+from pup.sysid.imu import imu_names, with_imu
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -157,7 +158,8 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
       robot: the robot it should be of.
 
     Returns:
-      The torque law and the robot's space for it with the fitted values as the nominal ones.
+      The torque law and the robot's space for it with the fitted values as the nominal ones; with
+      the parameters of an IMU that was fitted beside.
 
     Raises:
       InputError: the file is not a bounds file, or not of this robot.
@@ -171,6 +173,7 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
         kind = document["actuator"]["kind"]
         values = {p["name"]: float(p["nominal"]) for p in document["parameters"]}
         weights = [float(weight) for weight in document["actuator"]["weights"]]
+        imu = {p["name"]: float(p["nominal"]) for p in document.get("imu", [])}
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
@@ -185,10 +188,14 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
     if kind == "nn_pd" and len(weights) != len(NETWORK_NAMES):
         raise InputError(f"{path}: {len(weights)} network weights, {len(NETWORK_NAMES)} expected")
     values |= dict(zip(NETWORK_NAMES, weights, strict=False))
-    for name, value in values.items():
+    for name, value in (values | imu).items():
         if not np.isfinite(value):
             raise InputError(f"{path}: parameter {name!r} is {value}; expected a finite number")
-    return kind, space.at(values)
+    if imu:
+        space = with_imu(space)
+        if strange := [name for name in imu if name not in imu_names(space)]:
+            raise InputError(f"{path}: parameter {strange[0]!r} is not one of an IMU")
+    return kind, space.at(values | imu)
 
 
 @dataclass(frozen=True)

@@ -84,18 +84,18 @@ class Spread:
         return self.confidence(1 - (1 - level) / len(self.space))
 
     def among(self, space: ParameterSpace) -> "Spread":
-        """The same among parameters that were taken as known, at the space's nominal values.
+        """What it says of another space's parameters; those it has not were taken as known there.
 
         Args:
-          space: with the parameters of this spread in it.
+          space: the parameters, with what was taken as known at its nominal values.
         """
-        at = [space.names.index(name) for name in self.space.names]
+        mine = [i for i, name in enumerate(self.space.names) if name in space.names]
+        at = [space.names.index(self.space.names[i]) for i in mine]
         centre = space.normalise(space.nominal)
         covariance = np.zeros((len(space), len(space)))
         freedom = np.full(len(space), np.inf)
-        centre[at], covariance[np.ix_(at, at)], freedom[at] = (
-            self.centre, self.covariance, self.freedom,
-        )  # fmt: skip
+        centre[at], freedom[at] = self.centre[mine], self.freedom[mine]
+        covariance[np.ix_(at, at)] = self.covariance[np.ix_(mine, mine)]
         return Spread(space, centre, covariance, freedom)
 
 

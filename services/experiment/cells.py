@@ -13,7 +13,9 @@ from pup.robot import RobotDescription
 from services.experiment.plan import Fits, Plan, Walk, training
 
 FLEET = "presysid-fleet"
-DIAGNOSED = "presysid-fleet-diagnosed"
+DIAGNOSED = "diagnosed"
+"""Of a fleet that is simulated with what its diagnoses share: a stage, and how its cells end."""
+DIAGNOSED_FLEET = f"{FLEET}-{DIAGNOSED}"
 SEARCHED = (Method.PUP, Method.UP)
 """Methods whose policies are conditioned on something that trials can choose."""
 
@@ -96,8 +98,8 @@ class _Graph:
         """Which stage a cell belongs to."""
         if cell.name.endswith("-real"):
             return "real"
-        if cell.name.endswith("-diagnosed"):
-            return "diagnosed"
+        if cell.name.endswith(f"-{DIAGNOSED}"):
+            return DIAGNOSED
         if "corrected" in cell.name or cell.name.endswith("-own"):
             return "corrected"
         if cell.name.endswith("-prior") or cell.kind == "landscape":
@@ -208,22 +210,22 @@ class _Graph:
         refits = {seed: self._refit(seed) for seed in self.plan.seeds}
         needs = {f"fit {seed}": refit["bounds"] for seed, refit in refits.items()}
         needs |= {f"robot {seed}": refit["robot"] for seed, refit in refits.items()}
-        self._add(Cell(DIAGNOSED, "pooled", needs, self._told(), self._given(), 1.0))
+        self._add(Cell(DIAGNOSED_FLEET, "pooled", needs, self._told(), self._given(), 1.0))
         words = self.plan.train.diagnosed
         for walk in self.plan.walks:
             for method in walk.methods:
                 first = f"policy-{walk.direction}-{method}"
-                needs = {"bounds": DIAGNOSED, "robot": DIAGNOSED, "start": first}
+                needs = {"bounds": DIAGNOSED_FLEET, "robot": DIAGNOSED_FLEET, "start": first}
                 told = self._told(method=method, direction=walk.direction, training=words)
                 weight = 20 + training(words).steps / 5000
-                policy = f"{first}-diagnosed"
+                policy = f"{first}-{DIAGNOSED}"
                 self._add(Cell(policy, "policy", needs, told, self._given(), weight))
                 for seed in self._seeds(walk):
                     name, needs = f"trials-r{seed}-{walk.direction}-{method}", {"policy": policy}
                     searched = method in SEARCHED
                     needs |= refits[seed] if searched else {}
                     count = self.plan.trials.trials if searched else 1
-                    self._walked(f"{name}-diagnosed", seed, count, needs)
+                    self._walked(f"{name}-{DIAGNOSED}", seed, count, needs)
 
     def _corrected(self, walk: Walk) -> None:
         """The fleet's policy trained on for each robot, in its corrected simulator and its own."""

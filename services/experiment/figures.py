@@ -50,8 +50,9 @@ NAMES = {
 }
 """What arms are called where people read."""
 METHODS = tuple(COLOURS)
-FURTHER = {"own": PURPLE, "corrected": GREEN, "diagnosed": BLUE}
+FURTHER = {"own": PURPLE, "corrected": GREEN}
 """Colours of policies that were trained on."""
+DASHES = {"prior": "--", "diagnosed": ":"}
 QUANTITIES = {"distance": "distance, m", "time": "time before the fall, s"}
 
 
@@ -91,14 +92,14 @@ def _spread(at: float, wide: float, count: int) -> np.ndarray:
     return at + (np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)) * wide
 
 
-def per_robot(walks: Mapping[str, Any], fleet: str = "") -> Drawing:
+def per_robot(walks: Mapping[str, Any], end: str) -> Drawing:
     """Each method's mean distance on each robot, a row for each.
 
     Args:
       walks: of one direction, by arm and robot.
-      fleet: `+diagnosed` for policies that were trained on with what diagnoses share.
+      end: of the arms, one of `verdicts.FLEETS`.
     """
-    arms = [method + fleet for method in METHODS if method + fleet in walks]
+    arms = [method + end for method in METHODS if method + end in walks]
     robots = sorted({robot for arm in arms for robot in walks[arm]})
     figure = new_figure(WIDTH + 0.4, 1.1 + 0.24 * len(robots))
     axes = figure.subplots()
@@ -110,14 +111,14 @@ def per_robot(walks: Mapping[str, Any], fleet: str = "") -> Drawing:
         ]
         at = np.array([row for row, _ in rows]) + 0.14 * (arms.index(arm) - (len(arms) - 1) / 2)
         axes.errorbar(
-            middle, at, xerr=spread, fmt="o", ms=4, lw=0.9, color=COLOURS[arm.removesuffix(fleet)],
+            middle, at, xerr=spread, fmt="o", ms=4, lw=0.9, color=COLOURS[arm.removesuffix(end)],
             label=NAMES[arm],
         )  # fmt: skip
     _rows(axes, robots)
     axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
     axes.set_xlabel("distance, m (bars: deviation of the walks)")
     axes.grid(axis="x")
-    figure.legend(loc="outside upper left", ncols=2 if fleet else 4, fontsize=8)
+    figure.legend(loc="outside upper left", ncols=2 if end else 4, fontsize=8)
     return as_svg(figure)
 
 
@@ -141,7 +142,7 @@ def searches(part: Mapping[str, Any]) -> Drawing:
         shortest = min(map(len, shares))
         drawn = np.array([share[:shortest] for share in shares])
         trial, (method, _, more) = np.arange(1, shortest + 1), arm.partition("+")
-        colour, dash = FURTHER.get(more, COLOURS[method]), "--" if more == "prior" else "-"
+        colour, dash = FURTHER.get(more, COLOURS[method]), DASHES.get(more, "-")
         low, high = np.quantile(drawn, [0.25, 0.75], axis=0)
         axes.fill_between(trial, low, high, color=colour, alpha=0.1, lw=0)
         axes.plot(trial, np.median(drawn, axis=0), dash, color=colour, label=NAMES[arm])
@@ -170,7 +171,8 @@ def fleet_bounds(bounds: Mapping[str, Any]) -> Drawing:
         colour = BLUE if p["identified"] else PALE
         axes.barh(row, high - low, 0.6, left=low, color=colour, alpha=0.55)
         axes.vlines(nominal, row - 0.42, row + 0.42, color=RED, lw=2.2)
-        own = [(told[p["name"]] - first) / width for told in bounds["robots"].values()]
+        told = [robot[p["name"]] for robot in bounds["robots"].values() if p["name"] in robot]
+        own = [(value - first) / width for value in told]
         axes.plot(own, np.full(len(own), row), ".", color=INK, ms=4.5)
     axes.barh(0, 0, 0, color=BLUE, alpha=0.55, label="bounds of the fleet")
     axes.plot([], [], color=RED, lw=2.2, label="its nominal values")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pup.policy.shape import Method
-from services.experiment.cells import FLEET, Cell
+from services.experiment.cells import DIAGNOSED, DIAGNOSED_FLEET, FLEET, Cell
 from services.experiment.diagnosed import diagnoses
 from services.experiment.plan import Plan, Walk
 from services.experiment.run import Order, digest
@@ -16,7 +16,6 @@ SCHEMA = 1
 FURTHER = ("own", "corrected")
 PRIOR = "-prior"
 FITTED = "+fitted"
-DIAGNOSED = "diagnosed"
 
 
 def gather(
@@ -45,7 +44,8 @@ def gather(
         "plan": plan.document(),
         "acceptance": acceptance(directions, diagnosed),
         "directions": directions,
-        "bounds": _bounds(plan, found),
+        "bounds": _bounds(plan, found, FLEET, ""),
+        "bounds_diagnosed": _bounds(plan, found, DIAGNOSED_FLEET, "-corrected"),
         "diagnosis": diagnosed,
         "recordings": _recordings(plan, found),
         "real": _real(found),
@@ -103,14 +103,16 @@ def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, An
     return {"walks": walks, "searches": searches}
 
 
-def _bounds(plan: Plan, found: Mapping[str, Any]) -> dict[str, Any] | None:
+def _bounds(
+    plan: Plan, found: Mapping[str, Any], fleet_name: str, own_suffix: str
+) -> dict[str, Any] | None:
     """Bounds of the fleet, what each robot's own fit says, and how the fleet's went."""
-    if FLEET not in found:
+    if fleet_name not in found:
         return None
-    fleet = found[FLEET]
+    fleet = found[fleet_name]
     robots = {}
     for seed in plan.seeds:
-        if (own := found.get(f"presysid-r{seed}")) is not None:
+        if (own := found.get(f"presysid-r{seed}{own_suffix}")) is not None:
             robots[f"r{seed}"] = {p["name"]: p["nominal"] for p in own["parameters"]}
     return {
         "parameters": fleet["parameters"],

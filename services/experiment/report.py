@@ -10,6 +10,7 @@ from pup.files import write_atomic
 from pup.sysid.figures import LABELS, convergence, drawing_style
 from pup.sysid.html import Column, Html, figure, page, table, tag
 from services.experiment import figures
+from services.experiment.verdicts import FLEETS
 
 MISSING = "-"
 
@@ -58,6 +59,9 @@ def _content(told: Mapping[str, Any]) -> Iterator[Html]:
     if told["bounds"]:
         yield tag("h2", "Bounds of the fleet")
         yield from _bounds(told["bounds"])
+    if told["bounds_diagnosed"]:
+        yield tag("h2", "Bounds of the fleet with what its diagnoses share")
+        yield from _bounds(told["bounds_diagnosed"])
     if told["diagnosis"]["robots"]:
         yield tag("h2", "Diagnosis")
         yield from _diagnosis(told)
@@ -116,10 +120,10 @@ def _direction(part: Mapping[str, Any]) -> Iterator[Html]:
         if (arm := told["arms"].get(key)) is not None
     ]
     yield table("Walks: mean over robots, with the deviation of all walks", columns, rows)
-    for fleet, words in (("", ""), ("+diagnosed", ", trained on with what diagnoses share")):
-        if any(method + fleet in part["walks"] for method in figures.METHODS):
+    for end, words in zip(FLEETS, ("", ", trained on with what diagnoses share"), strict=True):
+        if any(method + end in part["walks"] for method in figures.METHODS):
             yield figure(
-                figures.per_robot(part["walks"], fleet),
+                figures.per_robot(part["walks"], end),
                 f"Mean distance of each method on each robot{words}.",
             )
     rows = [(f"farther than {name}", estimated(one)) for name, one in told["above"].items()]

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from services.experiment.cells import DIAGNOSED
 from services.experiment.statistics import (
     best_so_far,
     estimate,
@@ -19,19 +20,18 @@ ENOUGH = 0.95
 """Share of the distance after all trials that counts as as far."""
 PUP = "pup"
 RIVALS = ("robust", "nominal", "up")
-DIAGNOSED = "+diagnosed"
-"""Arms whose policies were trained on with what the fleet's diagnoses share."""
-FLEETS = ("", DIAGNOSED)
+FLEETS = ("", f"+{DIAGNOSED}")
+"""How arms end: trained for the fleet, and trained on with what its diagnoses share."""
 RATIOS = {
-    **{f"{PUP}{x} / {rival}{x}": (PUP + x, rival + x) for x in FLEETS for rival in RIVALS},
+    **{f"{PUP}{end} / {r}{end}": (PUP + end, r + end) for end in FLEETS for r in RIVALS},
     "prior / trials": (f"{PUP}+prior", PUP),
     "trials / no trials": (PUP, f"{PUP}+fitted"),
     "corrected / fleet, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+fitted"),
     "own / fleet, no trials": (f"{PUP}+own+fitted", f"{PUP}+fitted"),
     "corrected / own, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+own+fitted"),
     "corrected / fleet": (f"{PUP}+corrected", PUP),
-    "diagnosed / fleet, no trials": (f"{PUP}{DIAGNOSED}+fitted", f"{PUP}+fitted"),
-    "diagnosed / fleet": (f"{PUP}{DIAGNOSED}", PUP),
+    "diagnosed / fleet, no trials": (f"{PUP}+{DIAGNOSED}+fitted", f"{PUP}+fitted"),
+    "diagnosed / fleet": (f"{PUP}+{DIAGNOSED}", PUP),
 }
 """Means that are compared, over the robots that have both."""
 
@@ -51,7 +51,7 @@ def of_direction(part: Mapping[str, Any], seed: int) -> dict[str, Any]:
     walks = part["walks"]
     return {
         "arms": {arm: _arm(told, seed) for arm, told in walks.items()},
-        "above": _above(walks, "", seed) | _above(walks, DIAGNOSED, seed),
+        "above": {n: share for end in FLEETS for n, share in _above(walks, end, seed).items()},
         "ratios": {
             name: estimate(ratio, _means(walks, pair), seed).document()
             for name, pair in RATIOS.items()
@@ -67,13 +67,13 @@ def _means(walks: Mapping[str, Any], arms: Sequence[str]) -> list[list[float]]:
     return [[float(np.mean(walks[arm][r]["distance"])) for arm in arms] for r in robots]
 
 
-def _above(walks: Mapping[str, Any], fleet: str, seed: int) -> dict[str, Any]:
+def _above(walks: Mapping[str, Any], end: str, seed: int) -> dict[str, Any]:
     """On which share of the robots PUP comes farther than its rivals, each and two together."""
-    rivals = {rival + fleet: [rival + fleet] for rival in RIVALS if rival + fleet in walks}
-    both = [f"robust{fleet}", f"nominal{fleet}"]
+    rivals = {rival + end: [rival + end] for rival in RIVALS if rival + end in walks}
+    both = [f"robust{end}", f"nominal{end}"]
     if rivals.keys() >= set(both):
-        rivals[f"robust and nominal{fleet}"] = both
-    first = PUP + fleet
+        rivals[f"robust and nominal{end}"] = both
+    first = PUP + end
     rows = {n: _means(walks, [first, *r]) if first in walks else [] for n, r in rivals.items()}
     return {name: estimate(share_above, told, seed).document() for name, told in rows.items()}
 
@@ -117,13 +117,13 @@ def acceptance(directions: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> l
     lines = []
     for direction, part in directions.items():
         above, ratios = part["statistics"]["above"], part["statistics"]["ratios"]
-        for x, fleet in (("", direction), (DIAGNOSED, f"{direction}, diagnosed fleet")):
-            both = above.get(f"robust and nominal{x}") or above.get(f"robust{x}")
-            by = {rival: ratios.get(f"{PUP}{x} / {rival}{x}") for rival in ("robust", "nominal")}
+        for end, name in zip(FLEETS, (direction, f"{direction}, diagnosed fleet"), strict=True):
+            both = above.get(f"robust and nominal{end}") or above.get(f"robust{end}")
+            by = {rival: ratios.get(f"{PUP}{end} / {rival}{end}") for rival in RIVALS}
             lines += [
-                _line(f"{fleet}: robots on which PUP comes farther than its rivals", both, 0.8),
-                _line(f"{fleet}: PUP by Robust", by["robust"], 1.5),
-                _line(f"{fleet}: PUP by Nominal", by["nominal"], 2.0),
+                _line(f"{name}: robots on which PUP comes farther than its rivals", both, 0.8),
+                _line(f"{name}: PUP by Robust", by["robust"], 1.5),
+                _line(f"{name}: PUP by Nominal", by["nominal"], 2.0),
             ]
         lines += [
             _line(

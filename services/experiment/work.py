@@ -22,7 +22,7 @@ from services.experiment.cells import Cell
 RESULT = "result.json"
 """What a cell found, the same whenever and wherever it is done."""
 CORRECTED = "corrected"
-SHARED = "What was missing in at least half of a fleet's robots, in the median of them."
+SHARED = "The median robot of a fleet, with what was missing in most of its robots."
 
 
 @dataclass(frozen=True)
@@ -120,10 +120,13 @@ def pooled(task: Task) -> dict[str, Any]:
     files = [f / "bounds.json" for part, f in task.needed.items() if part.startswith("fit ")]
     folders = [f / CORRECTED for part, f in task.needed.items() if part.startswith("robot ")]
     corrected, robot = [RobotDescription.load(str(folder)) for folder in folders], task.robot
+    terms = shared_terms(corrected, robot)
+    bounds = pooled(files, robot, corrected, terms)
     if corrected:
-        terms = shared_terms(corrected)
-        robot = write_corrected(robot, task.out / CORRECTED, {}, terms, SHARED)
-    bounds = pooled(files, robot, corrected)
+        values = dict(zip(bounds.space.names, map(float, bounds.nominal), strict=True))
+        nominal = {p.name: values[p.name] for p in robot.parameters if p.name in values}
+        all_terms, law = (*robot.terms, *terms), bounds.actuator
+        write_corrected(robot, task.out / CORRECTED, nominal, all_terms, SHARED, law)
     bounds.write(task.out / "bounds.json")
     return _bounds(bounds.document())
 
