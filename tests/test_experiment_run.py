@@ -246,7 +246,7 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert not {"b", "script", "link"} & {name for name, _ in page.elements}
     assert "needs <b>presysid</b>" in page.text and "stopped by overload: <b>" in page.text
     images = [attributes["src"] for name, attributes in page.elements if name == "img"]
-    assert len(images) == 21 and all(i.startswith("data:image/svg+xml") for i in images)
+    assert len(images) == 24 and all(i.startswith("data:image/svg+xml") for i in images)
     assert estimated(ratios["pup / robust"]) in page.text
 
 

@@ -26,6 +26,7 @@ from pup.sysid.figures import (
 )
 from pup.sysid.html import Drawing
 from services.experiment.statistics import best_so_far
+from services.experiment.verdicts import FLEETS
 
 COLOURS = {"pup": VERMILLION, "up": AMBER, "robust": BLUE, "nominal": SOFT}
 NAMES = {
@@ -59,33 +60,45 @@ QUANTITIES = {"distance": "distance, m", "time": "time before the fall, s"}
 def walked(directions: Mapping[str, Any], quantity: str) -> Drawing:
     """Distance or time of each direction and method, with the deviation of all walks (the paper's).
 
+    Where policies were trained on with what diagnoses share, theirs stand beside.
+
     Args:
       directions: of the document.
       quantity: `distance` or `time`.
     """
     figure = new_figure(WIDTH + 0.9, 3.0)
     axes = figure.subplots()
-    wide = 0.8 / len(METHODS)
-    for i, part in enumerate(directions.values()):
+    wide, groups = 0.8 / len(METHODS), _groups(directions)
+    for i, (part, end) in enumerate(groups.values()):
         arms = part["statistics"]["arms"]
-        there = [method for method in METHODS if method in arms]
+        there = [method for method in METHODS if method + end in arms]
         for k, method in enumerate(there):
-            at, bar = i + (k - (len(there) - 1) / 2) * wide, arms[method][quantity]
+            at, bar = i + (k - (len(there) - 1) / 2) * wide, arms[method + end][quantity]
             axes.bar(at, bar["value"], wide * 0.9, color=COLOURS[method], alpha=0.75)
             axes.errorbar(at, bar["value"], yerr=bar["std"] or 0, color=INK, capsize=2.5, lw=1)
-            means = [float(np.mean(w[quantity])) for w in part["walks"][method].values()]
+            means = [float(np.mean(w[quantity])) for w in part["walks"][method + end].values()]
             axes.plot(_spread(at, wide, len(means)), means, ".", color=INK, ms=3.5, alpha=0.6)
     for method in METHODS:
-        if any(method in part["walks"] for part in directions.values()):
+        if any(method + end in part["walks"] for part, end in groups.values()):
             axes.bar(0, 0, 0, color=COLOURS[method], alpha=0.75, label=NAMES[method])
-    axes.set_xticks(range(len(directions)), list(directions))
-    axes.set_xlim(-0.55, len(directions) - 0.45)
+    axes.set_xticks(range(len(groups)), list(groups))
+    axes.set_xlim(-0.55, len(groups) - 0.45)
     axes.tick_params(axis="x", length=0)
     axes.set_ylabel(QUANTITIES[quantity])
     axes.axhline(0, color=SOFT, lw=0.8)
     axes.grid(axis="y")
     figure.legend(loc="outside upper left", ncols=4, fontsize=8)
     return as_svg(figure)
+
+
+def _groups(directions: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], str]]:
+    """What stands side by side, by caption: the walks of a direction, and how their arms end."""
+    groups = {}
+    for direction, part in directions.items():
+        for end, words in zip(FLEETS, ("", "\ndiagnosed fleet"), strict=True):
+            if any(method + end in part["walks"] for method in METHODS):
+                groups[direction + words] = part, end
+    return groups
 
 
 def _spread(at: float, wide: float, count: int) -> np.ndarray:
@@ -179,7 +192,7 @@ def fleet_bounds(bounds: Mapping[str, Any]) -> Drawing:
     axes.plot([], [], ".", color=INK, ms=4.5, label="fits of single robots")
     _rows(axes, [p["name"] for p in parameters])
     axes.set_xlim(-0.01, 1.01)
-    axes.set_xlabel("search range (0: lower end, 1: upper end)")
+    axes.set_xlabel("search range, 0 to 1")
     axes.grid(axis="x")
     figure.legend(loc="outside upper left", ncols=2, fontsize=8)
     return as_svg(figure)
@@ -203,7 +216,8 @@ def before_after(robots: Mapping[str, tuple[float, float]], label: str) -> Drawi
         axes.plot(before, row, "o", ms=5, color=SOFT, label="before" if row == 0 else None)
         axes.plot(after, row, "o", ms=5, color=GREEN, label="after" if row == 0 else None)
     _rows(axes, names)
-    axes.set_xlim(left=min(0.0, *(min(pair) for pair in robots.values())))
+    if min(min(pair) for pair in robots.values()) >= 0:
+        axes.set_xlim(left=0.0)
     axes.set_xlabel(label)
     axes.grid(axis="x")
     figure.legend(loc="outside upper left", ncols=2, fontsize=8)

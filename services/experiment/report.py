@@ -208,19 +208,7 @@ def _diagnosis(told: Mapping[str, Any]) -> Iterator[Html]:
             f"Lower by {estimated(found['improvement'])} (median share).",
         )
     for direction, part in told["directions"].items():
-        before, after = (part["walks"].get(a, {}) for a in ("pup+fitted", "pup+corrected+fitted"))
-        pairs = {
-            robot: tuple(float(np.mean(w[robot]["distance"])) for w in (before, after))
-            for robot in before
-            if robot in after
-        }
-        if pairs:
-            yield figure(
-                figures.before_after(pairs, "distance without trials, m"),
-                f"Distance {direction} without trials, before and after the correction.",
-                f"{direction}: eta of the fitted parameters, before (fleet's policy) and after "
-                "(trained on in the corrected simulator).",
-            )
+        yield from _without_trials(direction, part["walks"])
     columns = [Column("Robot"), Column("Verdict"), Column("Classes named", "long")]
     columns += [Column("Before [mrad]", "number"), Column("After", "number")]
     rows = [
@@ -238,6 +226,27 @@ def _diagnosis(told: Mapping[str, Any]) -> Iterator[Html]:
     rows = [(part, estimated(one)) for part, one in found["named"].items()]
     rows += [(f"class {name}", estimated(one)) for name, one in found["classes"].items()]
     yield table("Concealed parts and classes of effects that were named", columns, rows)
+
+
+def _without_trials(direction: str, walks: Mapping[str, Any]) -> Iterator[Html]:
+    before = walks.get("pup+fitted", {})
+    for way, where in (
+        ("corrected", "the corrected simulator of this robot"),
+        ("diagnosed", "a simulator of the fleet with what its diagnoses share"),
+    ):
+        after = walks.get(f"pup+{way}+fitted", {})
+        pairs = {
+            robot: tuple(float(np.mean(w[robot]["distance"])) for w in (before, after))
+            for robot in before
+            if robot in after
+        }
+        if pairs:
+            yield figure(
+                figures.before_after(pairs, "distance without trials, m"),
+                f"Distance {direction} without trials, before and after training in {where}.",
+                f"{direction}: eta of the fitted parameters, before (fleet's policy) and after "
+                f"(trained on in {where}).",
+            )
 
 
 def _real(told: Mapping[str, Any]) -> Iterator[Html]:
