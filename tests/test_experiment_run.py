@@ -294,3 +294,12 @@ def test_mistakes_are_told_in_a_line(
     done = pup("experiment", "--out", tmp_path / "out", "--local", *options)
     assert done.code == 2 and REFUSED[options] in done.err, done.err
     assert "Traceback" not in done.err and not (tmp_path / "out").exists()
+
+
+def test_where_there_is_nothing_to_do_it_says_so(tmp_path: Path) -> None:
+    """One robot shares nothing with others."""
+    asked = ("experiment", "--small", "--seeds", "1000", "--stages", "diagnosed", "--local")
+    refused = pup(*asked, "--out", tmp_path / "out")
+    assert refused.code == 2
+    assert refused.err.strip().startswith("pup experiment: nothing to do in diagnosed: a diagnosed")
+    assert not (tmp_path / "out").exists()

@@ -30,6 +30,11 @@ def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
     quiet()
     plan = plan_of(options)
     cells = graph(plan, options.policies, options.real)
+    if not cells:
+        raise InputError(
+            f"nothing to do in {', '.join(plan.stages) or 'no stage'}: a diagnosed fleet is of two "
+            "robots or more, the corrected are of walks of PUP; name other stages or seeds"
+        )
     with places.cases(options) as (pools, _), counted("experiment") as tell:
         if options.cell is not None:
             return run_again(cells, options.cell, out, pools, tell)
