@@ -16,12 +16,11 @@ from services.options import (
 )
 
 TRAINING = (
-    ("--steps", (1000, 10**11), int, 10_000_000, "control steps of all simulations together"),
+    ("--steps", (1000, 10**11), int, 3_000_000, "control steps of all simulations together"),
     ("--simulations", (1, 65536), int, 256, "at once, of each process that simulates"),
     ("--length", (2, 4096), int, 80, "control steps of each simulation between two updates"),
     ("--epochs", (1, 100), int, 5, "passes over the samples of an update"),
     ("--minibatch", (16, 2**20), int, 256, "samples of a gradient step"),
-    ("--learning-rate", (1e-7, 1.0), float, 3e-4, "at the beginning"),
     ("--entropy", (0.0, 10.0), float, 0.0, "weight of exploration, falling to 0"),
     ("--mirror", (0.0, 1000.0), float, 1.0, "weight of left-right symmetry; never sideways"),
 )
@@ -53,6 +52,13 @@ def train(verb: argparse.ArgumentParser) -> None:
         "--start", type=Path, metavar="DIR", help="policy to train further; default: from scratch"
     )
     policy.add_argument(
+        "--pattern",
+        type=number(0, 10_000),
+        metavar="N",
+        help="generations of the search for a gait pattern, which a policy from scratch is shown "
+        "before it explores; 0: none, as the paper; default: 120",
+    )
+    policy.add_argument(
         "--track",
         choices=("wandb", "mlflow"),
         action="append",
@@ -67,6 +73,13 @@ def train(verb: argparse.ArgumentParser) -> None:
             metavar="N" if kind is int else "X",
             help=f"{told}; default: %(default)s",
         )
+    policy.add_argument(
+        "--learning-rate",
+        type=number(1e-7, 1.0, float),
+        metavar="X",
+        help="at the beginning; default: 1e-4 for a policy that walks already, by --pattern or "
+        "--start, else 3e-4",
+    )
     policy.add_argument(
         "--sharpen",
         type=number(0.1, 10.0, float),

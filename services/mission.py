@@ -62,7 +62,7 @@ class Means:
       replays: opens where a diagnosis replays.
       ray: connects to the Ray of the training, and gives the cores there are.
       progress: opens what is told how far fits are.
-      looked: opens what is told how far the diagnosis is.
+      looked: opens what is told how far the diagnosis is, and what a training begins with.
       trained: opens what is told how far the training is.
       told: hears how far the trials are.
       threads: cores for what runs in this process.

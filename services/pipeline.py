@@ -29,8 +29,6 @@ DIRECTION = "forward"
 ORDER = "presysid", "replay", "train", "walk", "transfer", "rehearsal"
 """Of a half's stages where they are told of."""
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
-FURTHER_RATE = 2e-4
-"""Adam's, where a policy that walks is trained further: the usual one would undo its gait."""
 EPISODES = 50
 DIAGNOSIS = "diagnosis"
 """Stage, and folder, between the two halves of a job."""
@@ -173,19 +171,24 @@ class _Job:
     def _train(self, half: Half) -> Stage | None:
         if not self.steps:
             return None
-        from services.training import Options as Training
         from services.training import train
-        from workers.learner import Learning
+        from services.training_options import PATTERN, usual_learning
+        from services.training_options import Options as Training
 
         start = self._start(half)
-        options = Training(steps=self.steps, seed=self.mission.presysid.seed, start=start)
-        if start is not None:
-            options = replace(options, learning=Learning(rate=FURTHER_RATE))
+        pattern = PATTERN if start is None else 0
+        options = Training(
+            steps=self.steps,
+            seed=self.mission.presysid.seed,
+            learning=usual_learning(start, pattern),
+            start=start,
+            pattern=pattern,
+        )
 
         def work() -> None:
-            with self.means.trained() as told:
+            with self.means.trained() as told, self.means.looked() as said:
                 bounds, out = self.out / half.at(BOUNDS), self.out / half.at("train")
-                train(half.robot, bounds, options, out, self.means.ray, told)
+                train(half.robot, bounds, options, out, self.means.ray, told, said)
 
         begun = {} if start is None else {"policy that it starts from": sha256(start / CARD)}
         inputs = _described(half) | self._hash(half.at(BOUNDS)) | begun

@@ -1,13 +1,12 @@
 """The training job: bounds in, a policy that walks out (paper, sections IV and VI)."""
 
-import argparse
 import hashlib
 import json
 import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,10 @@ from pup.errors import InputError
 from pup.files import sha256, write_json
 from pup.locomotion.engines import check_size
 from pup.locomotion.sampling import MARGIN
-from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.settings import TaskSettings
 from pup.locomotion.task import WalkingTask
 from pup.physics.engine import Engine
 from pup.policy.bundle import CARD, NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
-from pup.policy.losses import LossWeights
 from pup.policy.mirror import MirrorMap
 from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method, PolicyShape
@@ -31,9 +29,10 @@ from pup.sysid.problem import MODEL
 from pup.sysid.result import read_bounds
 from services.checkpoint import Checkpoint
 from services.curve import draw_curve
+from services.first_gait import FirstGait, read_gait
 from services.provenance import engine, now
 from services.tracking import Trackers
-from workers.learner import Learning
+from services.training_options import Options
 from workers.ppo import Iteration, Setup, Trainer
 from workers.rollouts import Sampling
 from workers.walking import Walking
@@ -42,47 +41,17 @@ CHECKPOINT_SECONDS = 30.0
 ROBOTS_A_THREAD = 64
 """Fewer wait longer for each other than they save: 256 robots on 16 cores take 5,000 steps a second
 on 16 threads and 8,100 on 4 (docs/results/training.md)."""
+GAIT_THREADS = 4
+"""Of the few robots that a first gait is searched on."""
 SMOOTHED = 10
 """Iterations whose mean return says which weights were best so far."""
-SHARPEN = 2.5
-"""By which exploration falls in a training from scratch; one that goes on explores as it did."""
 ETAS = 20_000
 """Draws of mu whose projections span eta's box."""
 
+Said = Callable[[str, float], None]
+"""Told what a training begins with, and the share of it that is done."""
 Told = Callable[[dict[str, Any], int], None]
 """Told each iteration's row of the curve, and the steps of the whole training."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """What is trained, and how long.
-
-    Attributes:
-      method: how the policy deals with unknown parameters.
-      direction: of the walk.
-      steps: control steps of all simulations together.
-      seed: of everything random.
-      simulations: at once, of each process that samples.
-      length: control steps of each between two updates.
-      learning: how the networks are moved; what follows from the rest is filled in.
-      runners: processes that sample; 0 for none beside this one.
-      start: bundle whose weights are trained further, perhaps of other bounds or parameters;
-        None draws weights.
-      track: other places that are told the curve, `wandb` and `mlflow`.
-      engine: what simulates.
-    """
-
-    method: Method = Method.PUP
-    direction: Direction = Direction.FORWARD
-    steps: int = 10_000_000
-    seed: int = 0
-    simulations: int = 256
-    length: int = 80
-    learning: Learning = field(default_factory=Learning)
-    runners: int = 0
-    start: Path | None = None
-    track: tuple[str, ...] = ()
-    engine: Engine = Engine.MUJOCO
 
 
 def train(
@@ -92,6 +61,7 @@ def train(
     out: Path,
     cluster: Callable[[], AbstractContextManager[int]],
     told: Told,
+    said: Said = lambda words, share: None,
 ) -> dict[str, Any]:
     """Train a policy and write its files; a training that was interrupted goes on.
 
@@ -99,10 +69,11 @@ def train(
       robot: the robot.
       bounds: what pre-sysID wrote; None for the robot's `identified.json`.
       options: what is trained.
-      out: folder for `policy/`, `best/`, `training.json`, `curve.png`, `tensorboard/` and
-        `checkpoint.npz`.
+      out: folder for `policy/`, `best/`, `training.json`, `curve.png`, `tensorboard/`,
+        `checkpoint.npz`, and `pattern.npz` and `pattern.json` of what it begins with.
       cluster: connects to Ray and gives the cores there are.
       told: how far it is.
+      said: how far what it begins with is.
 
     Returns:
       The document of `training.json`.
@@ -110,34 +81,7 @@ def train(
     Raises:
       InputError: robot, bounds or first policy do not fit, or the folder holds another training.
     """
-    return _Job(robot, bounds, options, out, told).run(cluster)
-
-
-def training_options(given: argparse.Namespace) -> Options:
-    """What `pup train` was told."""
-    weights = LossWeights(entropy=given.entropy, mirror=given.mirror)
-    usual = SHARPEN if given.start is None else 1.0
-    learning = Learning(
-        epochs=given.epochs,
-        minibatch=given.minibatch,
-        rate=given.learning_rate,
-        schedule=given.schedule,
-        weights=weights,
-        sharpen=usual if given.sharpen is None else given.sharpen,
-    )
-    return Options(
-        method=Method(given.method),
-        direction=Direction(given.direction),
-        steps=given.steps,
-        seed=given.seed,
-        simulations=given.simulations,
-        length=given.length,
-        learning=learning,
-        runners=given.runners,
-        start=given.start,
-        track=tuple(given.track),
-        engine=Engine(given.engine),
-    )
+    return _Job(robot, bounds, options, out, told, said).run(cluster)
 
 
 class _Job:
@@ -148,8 +92,11 @@ class _Job:
         options: Options,
         out: Path,
         told: Told,
+        said: Said,
     ) -> None:
-        self.robot, self.options, self.out, self.told = robot, options, out, told
+        if options.start is not None:
+            options = replace(options, pattern=0)
+        self.robot, self.options, self.out, self.told, self.said = robot, options, out, told, said
         self.source = bounds or robot.identified_path
         if bounds is None and not self.source.exists():
             raise InputError(
@@ -194,6 +141,8 @@ class _Job:
         return document
 
     def _go_on(self, cores: int, trackers: Trackers) -> None:
+        if self.options.pattern and not self.kept.state:
+            self.first = self._gait(cores).weights(self.said)
         with closing(Trainer(self._setup(cores))) as trainer:
             if self.kept.state:
                 trainer.restore(self.kept.state)
@@ -209,6 +158,11 @@ class _Job:
                     written, found = time.monotonic(), None
             self._bundle("policy", trainer.weights())
             self._write(trainer, found)
+
+    def _gait(self, cores: int) -> FirstGait:
+        o, digest = self.options, self.kept.digest
+        threads = min(cores, GAIT_THREADS)
+        return FirstGait(self.walking, self.shape, o.pattern, o.seed, threads, self.out, digest)
 
     def _iterate(self, trainer: Trainer) -> dict[str, Any]:
         begin = time.monotonic()
@@ -243,6 +197,7 @@ class _Job:
         provenance = {
             "options": self._told_options(),
             "start": self.origin,
+            "pattern": read_gait(self.out) if self.options.pattern else None,
             "steps": steps,
             "seconds": round(self.seconds, 1),
             "terms": [asdict(term) for term in self.robot.terms],
@@ -347,6 +302,8 @@ class _Job:
         del told["track"]
         if self.options.engine is Engine.MUJOCO:
             del told["engine"]  # as before there were two
+        if not self.options.pattern:
+            del told["pattern"]  # as before there was one
         first = hashlib.sha256()
         for name, value in (self.first or {}).items():
             first.update(name.encode() + value.tobytes())
@@ -375,6 +332,7 @@ class _Job:
             "provenance": {
                 "options": self._told_options(),
                 "start": self.origin,
+                "pattern": read_gait(self.out) if self.options.pattern else None,
                 "bounds": str(self.source),
                 "bounds_sha256": self.bounds_sha256,
                 "robot_digest": self.robot.digest,

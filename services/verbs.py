@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -86,15 +87,17 @@ def _train(options: argparse.Namespace) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("gymnasium") is None:
         raise InputError("training needs PyTorch and RLlib; install pup[learn]")
     _quiet_torch()
-    from services.progress import trained
+    from services.progress import stages, trained
     from services.tracking import check
-    from services.training import train, training_options
+    from services.training import train
+    from services.training_options import training_options
 
     check(tuple(options.track))
     robot = RobotDescription.load(options.robot)
-    with _folder(options.out) as out, trained() as told:
-        wanted = training_options(options)
-        return train(robot, options.bounds, wanted, out, lambda: places.training(options), told)
+    wanted = training_options(options)
+    with _folder(options.out) as out, trained() as told, stages() as said:
+        ray = partial(places.training, options)
+        return train(robot, options.bounds, wanted, out, ray, told, said)
 
 
 def _quiet_torch() -> None:

@@ -29,6 +29,7 @@ from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
 from services import training
 from services.arguments import parser
+from services.training_options import Options, training_options
 from workers.cluster import connected
 from workers.learner import FragmentsToBatch, Learning, merged, prepared, shuffled
 from workers.module import PolicyModule, load
@@ -268,15 +269,16 @@ def test_a_training_that_ends_does_not_wait_for_its_samples(ray_here: None) -> N
 
 # --- The job --------------------------------------------------------------------------------------
 
-SMALL = training.Options(
+SMALL = Options(
     steps=128,
     simulations=4,
     length=8,
     learning=Learning(epochs=2, minibatch=16, weights=LossWeights(mirror=1.0)),
+    pattern=0,
 )
 
 
-def job(out: Path, options: training.Options = SMALL, told=lambda row, steps: None):
+def job(out: Path, options: Options = SMALL, told=lambda row, steps: None):
     return training.train(ROBOT, None, options, out, lambda: nullcontext(2), told)
 
 
@@ -390,4 +392,4 @@ def test_the_learner_takes_a_gpu_where_it_is_faster(
 )
 def test_exploration_falls_from_scratch_unless_told(words: str, sharpen: float) -> None:
     given = parser().parse_args(["train", "--out", ".", *words.split()])
-    assert training.training_options(given).learning.sharpen == sharpen
+    assert training_options(given).learning.sharpen == sharpen

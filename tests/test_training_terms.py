@@ -16,6 +16,7 @@ from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
 from services import training
+from services.training_options import Options
 from services.walk import Shown, walk
 from workers.cluster import connected
 from workers.learner import Learning
@@ -28,8 +29,8 @@ FOUND = (
     TermSpec("measurement_delay", "bus", "", {"time": 0.01}),
     TermSpec("ground_compliance", "ground", "", {"time": 0.02}),
 )
-SMALL = training.Options(
-    steps=96, simulations=4, length=8, learning=Learning(epochs=2, minibatch=16)
+SMALL = Options(
+    pattern=0, steps=96, simulations=4, length=8, learning=Learning(epochs=2, minibatch=16)
 )
 
 

@@ -38,6 +38,10 @@ class Walks:
         """Those of all parts, one part after the other."""
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
+    def of(self, rows: slice) -> "Walks":
+        """Some of them."""
+        return Walks(*(getattr(self, f.name)[rows] for f in fields(self)))
+
     def summary(self) -> dict[str, float]:
         """Median distance, way aside and time, share without a fall, mean reward."""
         return {

@@ -234,6 +234,10 @@ class WalkingTask:
             time=episodes.time.copy(),
         )
 
+    def phase(self) -> Array:
+        """Cosine and sine of where the gait of each simulation is, shape (n, 2)."""
+        return self.reference.phase(self._episodes.time)
+
     def state(self) -> dict[str, NDArray[np.generic]]:
         """Everything the coming steps depend on, to go on from bit by bit."""
         told = json.dumps(self.rng.bit_generator.state).encode()
@@ -329,7 +333,7 @@ class WalkingTask:
             heading(root[:, 3:])[:, None],
             roll_pitch(root[:, 3:]) / self.gait.tilt_limit,
             velocity[:, :2] @ ahead / PACE,
-            self.reference.phase(self._episodes.time[rows]),
+            self.phase()[rows],
         )
         return np.concatenate(parts, axis=1)
 

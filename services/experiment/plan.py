@@ -230,7 +230,7 @@ class Plan:
 def small() -> Plan:
     """Two robots and the least work: whether everything fits together, in minutes."""
     fits = Fits(generations=2, population=4, subsets=2, subset_generations=1, fixed_network=True)
-    least = "--steps 1024 --simulations 16 --length 32"
+    least = "--steps 1024 --simulations 16 --length 32 --pattern 0"
     return Plan(
         seeds=(1000, 1001),
         walks=(Walk(Direction.FORWARD, ALL, 2),),

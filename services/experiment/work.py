@@ -141,7 +141,8 @@ def policy(task: Task) -> dict[str, Any]:
     """A policy: one that was given, or a training on bounds."""
     from pup.locomotion.settings import Direction
     from services.experiment.plan import training
-    from services.training import train, training_options
+    from services.training import train
+    from services.training_options import training_options
 
     told, folder = task.told, task.out / "policy"
     method, direction = Method(told["method"]), Direction(told["direction"])

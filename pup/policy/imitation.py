@@ -1,0 +1,75 @@
+"""Teaching a policy the actions of a teacher: behaviour cloning of bells over the bins."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pup.policy.network import SPREAD, ProjectedPolicy
+
+RATE = 1e-3
+MINIBATCH = 1024
+
+
+class Imitation:
+    """Learns from all demonstrations shown so far (Ross, Gordon and Bagnell 2011, DAgger).
+
+    What is learnt is a bell about the teacher's action, as wide as that of a policy that learnt
+    nothing: the pupil explores about what it was shown.
+
+    Args:
+      policy: the pupil; its normaliser takes the observations into account.
+      seed: of the order of samples.
+    """
+
+    def __init__(self, policy: ProjectedPolicy, seed: int) -> None:
+        self.policy = policy
+        self._rng = np.random.default_rng(seed)
+        learnt = [p for name, p in policy.named_parameters() if not name.startswith("critic")]
+        self._adam = torch.optim.Adam(learnt, lr=RATE)
+        self._shown: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def show(
+        self,
+        proprioception: NDArray[np.float32],
+        parameters: NDArray[np.float32],
+        bins: NDArray[np.floating],
+    ) -> None:
+        """Add demonstrations, a row each.
+
+        Args:
+          proprioception: shape (n, n_entries).
+          parameters: mu as told to the pupil, shape (n, n_parameters).
+          bins: the teacher's actions, between 0 and bins - 1, shape (n, joints).
+        """
+        seen = torch.from_numpy(proprioception)
+        self.policy.observations.update(seen)
+        actions = torch.from_numpy(bins.astype(np.float32))
+        self._shown.append((seen, torch.from_numpy(parameters), actions))
+
+    def learn(self, epochs: int) -> float:
+        """Go through all demonstrations so often; the mean loss of the last epoch, nats a joint."""
+        seen, told, actions = (torch.cat(parts) for parts in zip(*self._shown, strict=True))
+        loss = torch.zeros(())
+        for _ in range(epochs):
+            order = torch.from_numpy(self._rng.permutation(len(seen)))
+            losses = []
+            for rows in order.split(MINIBATCH):
+                loss = self._divergence(seen[rows], told[rows], actions[rows])
+                self._adam.zero_grad()
+                loss.backward()
+                self._adam.step()
+                losses.append(loss.item())
+            loss = torch.tensor(losses).mean()
+        return float(loss)
+
+    def _divergence(self, seen: Tensor, told: Tensor, actions: Tensor) -> Tensor:
+        """Cross entropy from the bells about the teacher's actions, nats a joint."""
+        log = torch.log_softmax(self.policy(seen, told), dim=-2)
+        return -(bell(actions, log.shape[-2]) * log).sum(dim=-2).mean()
+
+
+def bell(actions: Tensor, bins: int) -> Tensor:
+    """Probabilities of the bins, (n, bins, joints): bells of SPREAD about actions, (n, joints)."""
+    off = torch.arange(bins, dtype=actions.dtype)[:, None] - actions[:, None, :]
+    return torch.softmax(-(off**2) / (2 * SPREAD**2), dim=-2)

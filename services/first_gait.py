@@ -1,0 +1,135 @@
+"""The gait that a training from scratch begins with: searched, shown, and kept in its folder."""
+
+import io
+import json
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pup.errors import InputError
+from pup.files import write_atomic, write_json
+from pup.locomotion.demonstration import HORIZON, PUPILS, ROUNDS, PatternSearch, imitate
+from pup.locomotion.pattern import Patterns, PatternSpace
+from pup.locomotion.settings import TaskSettings
+from pup.locomotion.task import WalkingTask
+from pup.physics.engine import Engine
+from pup.policy.network import ProjectedPolicy
+from pup.policy.shape import PolicyShape
+from workers.walking import Walking
+
+State = dict[str, NDArray[Any]]
+LOSSES = "pattern.npz"
+DOCUMENT = "pattern.json"
+Said = Callable[[str, float], None]
+"""Told what is done, and the share of it."""
+
+
+@dataclass(frozen=True)
+class FirstGait:
+    """A search for a gait pattern and its imitation; see `pup.locomotion.demonstration`.
+
+    A search that was interrupted goes on; an imitation, which takes minutes, begins anew.
+
+    Attributes:
+      walking: makes the tasks; MuJoCo simulates them, whatever engine trains.
+      shape: of the policy.
+      generations: of the search.
+      seed: of everything random.
+      threads: of the simulations.
+      out: the training's folder.
+      digest: of the training.
+    """
+
+    walking: Walking
+    shape: PolicyShape
+    generations: int
+    seed: int
+    threads: int
+    out: Path
+    digest: str
+
+    def weights(self, said: Said) -> State:
+        """Weights of a policy that walks as the best pattern does; see `read_gait` for the pattern.
+
+        Raises:
+          InputError: the folder holds another training's search.
+        """
+        begin = time.monotonic()
+        settings = self.walking.settings
+        # Who strays goes on: a gait that does not yet go straight is worth more than none.
+        walked = replace(settings.evaluation(), horizon=HORIZON)
+        search = PatternSearch(
+            PatternSpace(self.walking.robot, settings.direction),
+            lambda n, seed: self._task(walked, n, seed),
+            self.seed,
+        )
+        search.resume(self._kept())
+        while len(search.losses) < self.generations:
+            told = search.generation()
+            self._keep(np.stack(search.losses))
+            words = f"gait pattern, {told.distance:.2f} m in {told.time:.1f} s"
+            said(words, told.index / self.generations)
+        pattern, walks = search.chosen()
+        weights = self._imitation(pattern, said)
+        document = {
+            "schema": 1,
+            "generations": self.generations,
+            "seconds": round(time.monotonic() - begin, 1),
+            "horizon": HORIZON,
+            **walks.summary(),
+            "waves": pattern.waves[0].tolist(),
+            "gains": pattern.gains[0].tolist(),
+        }
+        write_json(self.out / DOCUMENT, document)
+        return weights
+
+    def _imitation(self, pattern: Patterns, said: Said) -> State:
+        task = self._task(self.walking.settings, PUPILS, self.seed)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # as trainings have it: faster for networks of this size
+        try:
+            with torch.random.fork_rng():
+                torch.manual_seed(self.seed)
+                policy = ProjectedPolicy(self.shape)
+            imitate(policy, pattern, task, self.seed, lambda turn: said("imitation", turn / ROUNDS))
+        finally:
+            torch.set_num_threads(threads)
+        return {name: value.numpy() for name, value in policy.state_dict().items()}
+
+    def _task(self, settings: TaskSettings, simulations: int, seed: int) -> WalkingTask:
+        walking = replace(self.walking, settings=settings, engine=Engine.MUJOCO)
+        return walking(simulations, seed, self.threads)
+
+    def _kept(self) -> NDArray[np.float64]:
+        """Losses of a search that was interrupted."""
+        file = self.out / LOSSES
+        if not file.exists():
+            return np.empty((0, 0))
+        try:
+            with np.load(file, allow_pickle=False) as packed:
+                losses, digest = np.array(packed["losses"]), str(packed["digest"])
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise InputError(f"{file}: not a search for a gait; use another --out") from error
+        if digest != self.digest:
+            raise InputError(
+                f"{file}: the search of another training; repeat its command to go on with it, or "
+                "use another --out"
+            )
+        return losses
+
+    def _keep(self, losses: NDArray[np.float64]) -> None:
+        packed = io.BytesIO()
+        np.savez(packed, allow_pickle=False, losses=losses, digest=np.array(self.digest))
+        write_atomic(self.out / LOSSES, packed.getvalue())
+
+
+def read_gait(out: Path) -> dict[str, Any]:
+    """What a training in this folder began with: how far the pattern walks, and what it is."""
+    return dict(json.loads((out / DOCUMENT).read_text()))
