@@ -29,6 +29,9 @@ DIRECTION = "forward"
 ORDER = "presysid", "replay", "train", "walk", "transfer", "rehearsal"
 """Of a half's stages where they are told of."""
 BOUNDS, POLICY = "presysid/bounds.json", "train/policy"
+STEPS_A_GENERATION = 5000
+"""Steps of a training for each generation of the search for the gait that it begins with: a short
+training takes a short search."""
 EPISODES = 50
 DIAGNOSIS = "diagnosis"
 """Stage, and folder, between the two halves of a job."""
@@ -176,7 +179,7 @@ class _Job:
         from services.training_options import Options as Training
 
         start = self._start(half)
-        pattern = PATTERN if start is None else 0
+        pattern = min(PATTERN, self.steps // STEPS_A_GENERATION) if start is None else 0
         options = Training(
             steps=self.steps,
             seed=self.mission.presysid.seed,

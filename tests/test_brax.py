@@ -218,7 +218,19 @@ def test_the_whole_robot_moves_as_in_mujoco() -> None:
 def test_a_short_training_runs(tmp_path: Path) -> None:
     pytest.importorskip("gymnasium")
     told = pup(
-        *("train", "--engine", "brax", "--out", tmp_path / "out", "--steps", 1000, "--cores", 1),
+        *(
+            "train",
+            "--engine",
+            "brax",
+            "--out",
+            tmp_path / "out",
+            "--steps",
+            1000,
+            "--pattern",
+            0,
+            "--cores",
+            1,
+        ),
         *("--simulations", 8, "--length", 8, "--minibatch", 32, "--json"),
     )
     assert told.code == 0, told.err

@@ -130,7 +130,7 @@ SMALL = {
         *("--local", "--cores", 1, "--population", 8, "--generations", 8),
         *("--subsets", 2, "--subset-generations", 4),
     ),
-    "train": ("--steps", 60_000, "--simulations", 64, "--cores", 1),
+    "train": ("--steps", 60_000, "--pattern", 0, "--simulations", 64, "--cores", 1),
     "diagnose": ("--local", "--cores", 1),
 }
 """What makes the tutorial's commands quick."""

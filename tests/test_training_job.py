@@ -16,7 +16,7 @@ from services.transfer import read_simulated
 pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 
-SMALL = ("--simulations", 4, "--length", 8, "--minibatch", 16, "--cores", 1)
+SMALL = ("--simulations", 4, "--length", 8, "--minibatch", 16, "--pattern", 0, "--cores", 1)
 
 
 @pytest.mark.ray
