@@ -150,9 +150,15 @@ class _Graph:
             given = self._given(policy=str(folder.absolute()))
             self._add(Cell(name, "policy", {}, told, given))
             return
-        told = self._told(method=method, direction=walk.direction, training=train.fleet)
-        needs, weight = {"bounds": FLEET}, 20 + training(train.fleet).steps / 5000
-        self._add(Cell(name, "policy", needs, told, self._given(), weight))
+        self._trained(name, walk, method, train.fleet, {"bounds": FLEET})
+
+    def _trained(
+        self, name: str, walk: Walk, method: Method, words: str, needs: Mapping[str, str]
+    ) -> None:
+        """A policy that is trained as words tell."""
+        told = self._told(method=method, direction=walk.direction, training=words)
+        weight = 20 + training(words).steps / 5000
+        self._add(Cell(name, "policy", dict(needs), told, self._given(), weight))
 
     def _shelf(self, walk: Walk, method: Method) -> Path | None:
         """A policy that is trained already."""
@@ -169,13 +175,19 @@ class _Graph:
             needs = {"policy": policy, "bounds": FLEET}
             self._add(Cell(landscape, "landscape", needs, told, self._given(), 60.0))
         for seed in self._seeds(walk):
-            name = f"trials-r{seed}-{walk.direction}-{method}"
-            if method not in SEARCHED:
-                self._walked(name, seed, 1, {"policy": policy})
-                continue
-            needs = {"policy": policy, "bounds": f"presysid-r{seed}"}
-            self._walked(name, seed, trials.trials, needs)
-            self._walked(f"{name}-prior", seed, trials.prior, needs | {"landscape": landscape})
+            name, fitted = f"trials-r{seed}-{walk.direction}-{method}", f"presysid-r{seed}"
+            self._tried(name, seed, method, policy, {"bounds": fitted})
+            if method in SEARCHED:
+                needs = {"policy": policy, "bounds": fitted, "landscape": landscape}
+                self._walked(f"{name}-prior", seed, trials.prior, needs)
+
+    def _tried(
+        self, name: str, seed: int, method: Method, policy: str, simulator: Mapping[str, str]
+    ) -> None:
+        """Walks of a policy; after trials where these can choose what it is conditioned on."""
+        searched = method in SEARCHED
+        needs = {"policy": policy} | (simulator if searched else {})
+        self._walked(name, seed, self.plan.trials.trials if searched else 1, needs)
 
     def _walked(self, name: str, seed: int, count: int, needs: Mapping[str, str]) -> None:
         trials = self.plan.trials
@@ -216,16 +228,11 @@ class _Graph:
             for method in walk.methods:
                 first = f"policy-{walk.direction}-{method}"
                 needs = {"bounds": DIAGNOSED_FLEET, "robot": DIAGNOSED_FLEET, "start": first}
-                told = self._told(method=method, direction=walk.direction, training=words)
-                weight = 20 + training(words).steps / 5000
                 policy = f"{first}-{DIAGNOSED}"
-                self._add(Cell(policy, "policy", needs, told, self._given(), weight))
+                self._trained(policy, walk, method, words, needs)
                 for seed in self._seeds(walk):
-                    name, needs = f"trials-r{seed}-{walk.direction}-{method}", {"policy": policy}
-                    searched = method in SEARCHED
-                    needs |= refits[seed] if searched else {}
-                    count = self.plan.trials.trials if searched else 1
-                    self._walked(f"{name}-{DIAGNOSED}", seed, count, needs)
+                    name = f"trials-r{seed}-{walk.direction}-{method}-{DIAGNOSED}"
+                    self._tried(name, seed, method, policy, refits[seed])
 
     def _corrected(self, walk: Walk) -> None:
         """The fleet's policy trained on for each robot, in its corrected simulator and its own."""
@@ -238,10 +245,8 @@ class _Graph:
 
     def _further(self, walk: Walk, seed: int, way: str, needs: Mapping[str, str]) -> None:
         train, last = self.plan.train, f"r{seed}-{walk.direction}-{way}"
-        told = self._told(method=Method.PUP, direction=walk.direction, training=train.further)
-        weight = 20 + training(train.further).steps / 5000
         policy = f"policy-{last}"
-        self._add(Cell(policy, "policy", dict(needs), told, self._given(), weight))
+        self._trained(policy, walk, Method.PUP, train.further, needs)
         walked = {name: cell for name, cell in needs.items() if name != "start"}
         walked["policy"] = policy
         self._walked(f"trials-{last}", seed, self.plan.trials.trials, walked)
