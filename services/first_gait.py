@@ -1,7 +1,6 @@
 """The gait that a training from scratch begins with: searched, shown, and kept in its folder."""
 
 import io
-import json
 import time
 import zipfile
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.files import write_atomic, write_json
+from pup.files import read_json, write_atomic, write_json
 from pup.locomotion.demonstration import HORIZON, PUPILS, ROUNDS, PatternSearch, imitate
 from pup.locomotion.pattern import Patterns, PatternSpace
 from pup.locomotion.settings import TaskSettings
@@ -35,7 +34,9 @@ Said = Callable[[str, float], None]
 class FirstGait:
     """A search for a gait pattern and its imitation; see `pup.locomotion.demonstration`.
 
-    A search that was interrupted goes on; an imitation, which takes minutes, begins anew.
+    A search that was interrupted goes on, and so does one that shall be longer, or that another
+    training left in the folder which is like this one but for method and length; an imitation,
+    which takes minutes, begins anew.
 
     Attributes:
       walking: makes the tasks; MuJoCo simulates them, whatever engine trains.
@@ -44,7 +45,7 @@ class FirstGait:
       seed: of everything random.
       threads: of the simulations.
       out: the training's folder.
-      digest: of the training.
+      digest: of what the search depends on but the number of its generations.
     """
 
     walking: Walking
@@ -59,7 +60,7 @@ class FirstGait:
         """Weights of a policy that walks as the best pattern does; see `read_gait` for the pattern.
 
         Raises:
-          InputError: the folder holds another training's search.
+          InputError: the folder holds the search of another robot, task or seed.
         """
         begin = time.monotonic()
         settings = self.walking.settings
@@ -70,7 +71,7 @@ class FirstGait:
             lambda n, seed: self._task(walked, n, seed),
             self.seed,
         )
-        search.resume(self._kept())
+        search.resume(self._kept()[: self.generations])
         while len(search.losses) < self.generations:
             told = search.generation()
             self._keep(np.stack(search.losses))
@@ -119,8 +120,7 @@ class FirstGait:
             raise InputError(f"{file}: not a search for a gait; use another --out") from error
         if digest != self.digest:
             raise InputError(
-                f"{file}: the search of another training; repeat its command to go on with it, or "
-                "use another --out"
+                f"{file}: the search for another robot, task or seed; use another --out"
             )
         return losses
 
@@ -131,5 +131,9 @@ class FirstGait:
 
 
 def read_gait(out: Path) -> dict[str, Any]:
-    """What a training in this folder began with: how far the pattern walks, and what it is."""
-    return dict(json.loads((out / DOCUMENT).read_text()))
+    """What a training in this folder began with: how far the pattern walks, and what it is.
+
+    Raises:
+      InputError: it is gone or cannot be read.
+    """
+    return dict(read_json(out / DOCUMENT))

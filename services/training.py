@@ -160,8 +160,9 @@ class _Job:
             self._write(trainer, found)
 
     def _gait(self, cores: int) -> FirstGait:
-        o, digest = self.options, self.kept.digest
-        threads = min(cores, GAIT_THREADS)
+        o, threads = self.options, min(cores, GAIT_THREADS)
+        told = (MODEL, self.robot.digest, self.bounds_sha256, self.settings, self.walking.nominal)
+        digest = hashlib.sha256(repr((*told, o.seed)).encode()).hexdigest()
         return FirstGait(self.walking, self.shape, o.pattern, o.seed, threads, self.out, digest)
 
     def _iterate(self, trainer: Trainer) -> dict[str, Any]:

@@ -222,10 +222,22 @@ def test_an_interrupted_search_ends_alike(tmp_path: Path) -> None:
     assert after == told[2:]
     one, two = (np.load(tmp_path / n / "policy" / "weights.npz") for n in ("whole", "part"))
     assert all(np.array_equal(one[name], two[name]) for name in one.files)
-    other = replace(SMALL, seed=1)
-    (tmp_path / "part" / "checkpoint.npz").unlink()
-    with pytest.raises(InputError, match=r"pattern\.npz: the search of another training"):
-        job(tmp_path / "part", lambda words, share: None, other)
+
+
+@pytest.mark.ray
+@pytest.mark.usefixtures("small", "ray_here")
+def test_a_search_serves_other_trainings_of_the_same_task(tmp_path: Path) -> None:
+    """Of another method or length, and is gone on with where it shall be longer."""
+    told: list[str] = []
+    job(tmp_path, lambda words, share: None)
+    (tmp_path / "checkpoint.npz").unlink()
+    longer = replace(SMALL, method=Method.ROBUST, steps=64, pattern=4)
+    job(tmp_path, lambda words, share: told.append(words), longer)
+    assert [words.split(",")[0] for words in told] == ["gait pattern", "imitation", "imitation"]
+    for other in (replace(SMALL, seed=1), replace(SMALL, direction=Direction.BACKWARD)):
+        (tmp_path / "checkpoint.npz").unlink(missing_ok=True)
+        with pytest.raises(InputError, match=r"pattern\.npz: the search for another robot"):
+            job(tmp_path, lambda words, share: None, other)
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from workers.cluster import connected
 from workers.fits import Fit, LocalRunner, RayRunner, Status
 
 pytestmark = pytest.mark.ray
-GENERATIONS = 16
+GENERATIONS = 12
 
 
 @pytest.fixture(scope="module")
