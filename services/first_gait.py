@@ -62,7 +62,6 @@ class FirstGait:
         Raises:
           InputError: the folder holds the search of another robot, task or seed.
         """
-        begin = time.monotonic()
         settings = self.walking.settings
         # Who strays goes on: a gait that does not yet go straight is worth more than none.
         walked = replace(settings.evaluation(), horizon=HORIZON)
@@ -71,10 +70,13 @@ class FirstGait:
             lambda n, seed: self._task(walked, n, seed),
             self.seed,
         )
-        search.resume(self._kept()[: self.generations])
+        identity = f"{self.digest} {search.identity}"
+        losses, spent = self._kept(identity)
+        begin = time.monotonic() - spent
+        search.resume(losses[: self.generations])
         while len(search.losses) < self.generations:
             told = search.generation()
-            self._keep(np.stack(search.losses))
+            self._keep(np.stack(search.losses), time.monotonic() - begin, identity)
             words = f"gait pattern, {told.distance:.2f} m in {told.time:.1f} s"
             said(words, told.index / self.generations)
         pattern, walks = search.chosen()
@@ -108,25 +110,27 @@ class FirstGait:
         walking = replace(self.walking, settings=settings, engine=Engine.MUJOCO)
         return walking(simulations, seed, self.threads)
 
-    def _kept(self) -> NDArray[np.float64]:
-        """Losses of a search that was interrupted."""
+    def _kept(self, identity: str) -> tuple[NDArray[np.float64], float]:
+        """Losses of a search that was interrupted, and the seconds that they took."""
         file = self.out / LOSSES
         if not file.exists():
-            return np.empty((0, 0))
+            return np.empty((0, 0)), 0.0
         try:
             with np.load(file, allow_pickle=False) as packed:
-                losses, digest = np.array(packed["losses"]), str(packed["digest"])
+                losses, told = np.array(packed["losses"]), str(packed["identity"])
+                spent = float(packed["seconds"])
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise InputError(f"{file}: not a search for a gait; use another --out") from error
-        if digest != self.digest:
+        if told != identity:
             raise InputError(
                 f"{file}: the search for another robot, task or seed; use another --out"
             )
-        return losses
+        return losses, spent
 
-    def _keep(self, losses: NDArray[np.float64]) -> None:
+    def _keep(self, losses: NDArray[np.float64], seconds: float, identity: str) -> None:
         packed = io.BytesIO()
-        np.savez(packed, allow_pickle=False, losses=losses, digest=np.array(self.digest))
+        told = {"seconds": np.array(seconds), "identity": np.array(identity)}
+        np.savez(packed, allow_pickle=False, losses=losses, **told)
         write_atomic(self.out / LOSSES, packed.getvalue())
 
 

@@ -78,6 +78,11 @@ class PatternSearch:
         self.losses: list[Array] = []
         self._best: list[Array] = []
 
+    @property
+    def identity(self) -> str:
+        """Of what the losses depend on beside the tasks: another search's are of no use."""
+        return f"{self._fit.identity} {ROBOTS} {HORIZON} {FALL} {STRAY}"
+
     def resume(self, losses: Array) -> None:
         """Go on after generations whose losses are known, shape (n_generations, POPULATION)."""
         for told in losses:
