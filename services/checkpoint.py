@@ -48,7 +48,7 @@ class Checkpoint:
                 told = {name: packed[name] for name in packed.files}
             meta = json.loads(told.pop(META).tobytes())
             schema, digest = meta["schema"], meta["digest"]
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
             raise InputError(f"{self.file}: not a checkpoint; use another --out") from error
         if (schema, digest) != (SCHEMA, self.digest):
             raise InputError(

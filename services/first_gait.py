@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from pup.errors import InputError
 from pup.files import read_json, write_atomic, write_json
@@ -27,7 +28,7 @@ State = dict[str, NDArray[Any]]
 LOSSES = "pattern.npz"
 DOCUMENT = "pattern.json"
 Said = Callable[[str, float], None]
-"""Told what is done, and the share of it."""
+"""Told what a training begins with, and the share of it that is done."""
 
 
 @dataclass(frozen=True)
@@ -64,22 +65,23 @@ class FirstGait:
         """
         settings = self.walking.settings
         # Who strays goes on: a gait that does not yet go straight is worth more than none.
-        walked = replace(settings.evaluation(), horizon=HORIZON)
+        walked = settings.evaluation()
         search = PatternSearch(
             PatternSpace(self.walking.robot, settings.direction),
-            lambda n, seed: self._task(walked, n, seed),
+            lambda n, seed, horizon: self._task(replace(walked, horizon=horizon), n, seed),
             self.seed,
         )
         identity = f"{self.digest} {search.identity}"
         losses, spent = self._kept(identity)
         begin = time.monotonic() - spent
-        search.resume(losses[: self.generations])
-        while len(search.losses) < self.generations:
-            told = search.generation()
-            self._keep(np.stack(search.losses), time.monotonic() - begin, identity)
-            words = f"gait pattern, {told.distance:.2f} m in {told.time:.1f} s"
-            said(words, told.index / self.generations)
-        pattern, walks = search.chosen()
+        with threadpool_limits(limits=1):  # CMA-ES hangs on the order of BLAS' sums
+            search.resume(losses[: self.generations])
+            while len(search.losses) < self.generations:
+                told = search.generation()
+                self._keep(np.stack(search.losses), time.monotonic() - begin, identity)
+                words = f"gait pattern, {told.distance:.2f} m in {told.time:.1f} s"
+                said(words, told.index / self.generations)
+            pattern, walks = search.chosen()
         weights = self._imitation(pattern, said)
         document = {
             "schema": 1,
@@ -119,7 +121,7 @@ class FirstGait:
             with np.load(file, allow_pickle=False) as packed:
                 losses, told = np.array(packed["losses"]), str(packed["identity"])
                 spent = float(packed["seconds"])
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
             raise InputError(f"{file}: not a search for a gait; use another --out") from error
         if told != identity:
             raise InputError(

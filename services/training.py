@@ -29,7 +29,7 @@ from pup.sysid.problem import MODEL
 from pup.sysid.result import read_bounds
 from services.checkpoint import Checkpoint
 from services.curve import draw_curve
-from services.first_gait import FirstGait, read_gait
+from services.first_gait import FirstGait, Said, read_gait
 from services.provenance import engine, now
 from services.tracking import Trackers
 from services.training_options import Options
@@ -48,8 +48,6 @@ SMOOTHED = 10
 ETAS = 20_000
 """Draws of mu whose projections span eta's box."""
 
-Said = Callable[[str, float], None]
-"""Told what a training begins with, and the share of it that is done."""
 Told = Callable[[dict[str, Any], int], None]
 """Told each iteration's row of the curve, and the steps of the whole training."""
 
@@ -94,8 +92,6 @@ class _Job:
         told: Told,
         said: Said,
     ) -> None:
-        if options.start is not None:
-            options = replace(options, pattern=0)
         self.robot, self.options, self.out, self.told, self.said = robot, options, out, told, said
         self.source = bounds or robot.identified_path
         if bounds is None and not self.source.exists():
@@ -141,9 +137,10 @@ class _Job:
         return document
 
     def _go_on(self, cores: int, trackers: Trackers) -> None:
+        setup = self._setup(cores)
         if self.options.pattern and not self.kept.state:
-            self.first = self._gait(cores).weights(self.said)
-        with closing(Trainer(self._setup(cores))) as trainer:
+            setup = replace(setup, start=self._gait(cores).weights(self.said))
+        with closing(Trainer(setup)) as trainer:
             if self.kept.state:
                 trainer.restore(self.kept.state)
             written, best = time.monotonic(), self._best()

@@ -35,7 +35,7 @@ class Options:
       start: bundle whose weights are trained further, perhaps of other bounds or parameters;
         None draws weights.
       pattern: generations of a search for the gait that a policy begins with; 0 for none, as the
-        paper; there is none where there is a `start`.
+        paper, and where there is a `start`.
       track: other places that are told the curve, `wandb` and `mlflow`.
       engine: what simulates.
     """
@@ -49,7 +49,7 @@ class Options:
     learning: Learning = field(default_factory=Learning)
     runners: int = 0
     start: Path | None = None
-    pattern: int = PATTERN
+    pattern: int = 0
     track: tuple[str, ...] = ()
     engine: Engine = Engine.MUJOCO
 
@@ -70,7 +70,8 @@ def training_options(given: argparse.Namespace) -> Options:
         raise InputError(
             f"--pattern {given.pattern}: the policy of --start walks already; leave one of them out"
         )
-    pattern = PATTERN if given.pattern is None else given.pattern
+    usual_pattern = PATTERN if given.start is None else 0
+    pattern = usual_pattern if given.pattern is None else given.pattern
     usual = usual_learning(given.start, pattern)
     learning = replace(
         usual,

@@ -14,7 +14,7 @@ from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
 from services.arguments import parser
 from services.experiment.cells import chosen, graph
-from services.experiment.plan import STAGES, Plan, Walk, read_plan, small, training
+from services.experiment.plan import STAGES, Plan, Walk, meant, read_plan, small, training
 
 DOCUMENTED = Path(__file__).parents[1] / "docs" / "experiment.md"
 
@@ -198,3 +198,19 @@ def test_words_of_a_training() -> None:
     assert training("--steps 5000 --minibatch 64").minibatch == 64
     with pytest.raises(InputError, match="unrecognized arguments"):
         training("--no-such-thing")
+
+
+def test_a_training_is_told_by_what_its_words_leave_out_too() -> None:
+    """Were a default another one, an experiment's cached policies would not be its own."""
+    usual, further = (meant("", further) for further in (False, True))
+    assert usual["pattern"] > 0 and usual["steps"] == training("").steps
+    assert further["pattern"] == 0
+    assert usual["learning"]["sharpen"] > further["learning"]["sharpen"]
+    cell = graph(small())["policy-forward-pup"]
+    assert cell.told["options"] == meant(small().train.fleet, further=False)
+
+
+def test_what_goes_on_from_a_gait_searches_for_none() -> None:
+    for name in ("further", "diagnosed"):
+        with pytest.raises(InputError, match=f"train: {name} goes on from a gait"):
+            replace(small(), train=replace(small().train, **{name: "--pattern 5"}))

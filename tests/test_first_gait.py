@@ -124,7 +124,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "STEPS": 30,
     }.items():
         monkeypatch.setattr(demonstration, name, value)
-    monkeypatch.setattr(first_gait, "HORIZON", 0.8)
     monkeypatch.setattr(demonstration, "HORIZON", 0.8)
     monkeypatch.setattr(first_gait, "PUPILS", 32)
     monkeypatch.setattr(first_gait, "ROUNDS", 2)
@@ -136,22 +135,22 @@ def ray_here() -> Iterator[None]:
         yield
 
 
-def make(horizon: float) -> Callable[[int, int], WalkingTask]:
+def make(n: int, seed: int, horizon: float) -> WalkingTask:
     told = replace(TaskSettings().evaluation(), horizon=horizon)
-    return lambda n, seed: walking(told, n, seed, sampler=ParameterSampler(BOUNDS))
+    return walking(told, n, seed, sampler=ParameterSampler(BOUNDS))
 
 
 @pytest.mark.usefixtures("small")
 def test_a_search_goes_on_where_another_was_stopped() -> None:
-    whole, first = (PatternSearch(space(), make(0.8), 3) for _ in range(2))
+    whole, first = (PatternSearch(space(), make, 3) for _ in range(2))
     expected_generations = [whole.generation() for _ in range(4)]
     told = [first.generation() for _ in range(2)]
-    second = PatternSearch(space(), make(0.8), 3)
+    second = PatternSearch(space(), make, 3)
     second.resume(np.stack(first.losses))
     told += [second.generation() for _ in range(2)]
     assert told == expected_generations
     np.testing.assert_array_equal(second.chosen()[0].waves, whole.chosen()[0].waves)
-    other = PatternSearch(space(), make(0.8), 4)
+    other = PatternSearch(space(), make, 4)
     assert other.generation() != told[0]
 
 
@@ -240,10 +239,17 @@ def test_a_search_serves_other_trainings_of_the_same_task(tmp_path: Path) -> Non
             job(tmp_path, lambda words, share: None, other)
 
 
+@pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY no"])
+def test_a_broken_search_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "pattern.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"pattern\.npz: not a search for a gait"):
+        job(tmp_path, lambda words, share: None)
+
+
 @pytest.mark.slow
 def test_a_search_finds_a_gait_that_walks() -> None:
     """A third of the usual one: half a metre in 7 s, on robots it has not seen, and up."""
-    search = PatternSearch(space(), make(demonstration.HORIZON), 0)
+    search = PatternSearch(space(), make, 0)
     for _ in range(25):
         search.generation()
     _, walks = search.chosen()

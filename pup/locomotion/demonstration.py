@@ -1,6 +1,7 @@
 """What a policy begins with: the gait pattern that a search found, learnt by imitation.
 
-Both see the task alone, its reward and its noise: nothing that a training without them would not.
+Both see the robots of the task and its noise alone, nothing that a training without them would not;
+but the search has an objective of its own, and the gait's phase leads the pattern.
 """
 
 from collections.abc import Callable
@@ -11,15 +12,18 @@ import torch
 from numpy.typing import NDArray
 
 from pup.locomotion.evaluation import Walks, evaluate
-from pup.locomotion.pattern import Patterns, PatternSpace
+from pup.locomotion.pattern import TURN, Patterns, PatternSpace
 from pup.locomotion.task import Observation, WalkingTask
 from pup.policy.imitation import Imitation
 from pup.policy.network import ProjectedPolicy, draw
 from pup.sysid.fit import CmaFit, FitSettings
 
 Array = NDArray[np.float64]
-MakeTask = Callable[[int, int], WalkingTask]
-"""Makes a task of so many simulations from a seed."""
+MakeTask = Callable[[int, int, float], WalkingTask]
+"""Makes a task of so many simulations, from a seed, with a horizon in s."""
+
+SEARCH = 1
+"""Raised with every change of what a search's losses depend on that `identity` does not tell."""
 
 POPULATION = 20
 ROBOTS = 4
@@ -67,7 +71,7 @@ class PatternSearch:
 
     Args:
       space: of the patterns.
-      make: makes the tasks that candidates walk in, with the search's HORIZON.
+      make: makes the tasks that candidates walk in.
       seed: of everything random.
     """
 
@@ -81,7 +85,7 @@ class PatternSearch:
     @property
     def identity(self) -> str:
         """Of what the losses depend on beside the tasks: another search's are of no use."""
-        return f"{self._fit.identity} {ROBOTS} {HORIZON} {FALL} {STRAY}"
+        return f"{SEARCH} {self._fit.identity} {ROBOTS} {HORIZON} {FALL} {STRAY} {TURN}"
 
     def resume(self, losses: Array) -> None:
         """Go on after generations whose losses are known, shape (n_generations, POPULATION)."""
@@ -113,7 +117,7 @@ class PatternSearch:
 
     def _walk(self, asked: Array, robots: int, index: int) -> Walks:
         seed = int(np.random.SeedSequence((self.seed, index)).generate_state(1)[0])
-        task = self.make(len(asked) * robots, seed)
+        task = self.make(len(asked) * robots, seed, HORIZON)
         patterns = self.space.patterns(asked).repeated(robots)
         return evaluate(lambda seen, _: taught(patterns, task, seen), task)
 
@@ -152,7 +156,8 @@ def imitate(
       told: the rounds that are done.
     """
     teacher = pattern.repeated(task.n)
-    lessons, rng = Imitation(policy, seed), np.random.default_rng(seed)
+    own, exploring = np.random.SeedSequence(seed).spawn(2)  # the task may have the seed itself
+    lessons, rng = Imitation(policy, own), np.random.default_rng(exploring)
     seen = task.reset()
     for turn in range(ROUNDS):
         for _ in range(STEPS):

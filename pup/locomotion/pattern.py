@@ -65,7 +65,7 @@ class PatternSpace:
 
     Joints that the reference gait moves take part. Where the robot has a mirror map one leg's
     reflex is the other's mirror image, and, if the direction has this symmetry too, so is its
-    pattern half a period later.
+    pattern half a period later. A joint that is its own mirror image is free.
 
     Args:
       robot: with a gait.

@@ -22,7 +22,7 @@ class Imitation:
       seed: of the order of samples.
     """
 
-    def __init__(self, policy: ProjectedPolicy, seed: int) -> None:
+    def __init__(self, policy: ProjectedPolicy, seed: np.random.SeedSequence) -> None:
         self.policy = policy
         self._rng = np.random.default_rng(seed)
         learnt = [p for name, p in policy.named_parameters() if not name.startswith("critic")]
@@ -47,21 +47,15 @@ class Imitation:
         actions = torch.from_numpy(bins.astype(np.float32))
         self._shown.append((seen, torch.from_numpy(parameters), actions))
 
-    def learn(self, epochs: int) -> float:
-        """Go through all demonstrations so often; the mean loss of the last epoch, nats a joint."""
+    def learn(self, epochs: int) -> None:
+        """Go through all demonstrations so often."""
         seen, told, actions = (torch.cat(parts) for parts in zip(*self._shown, strict=True))
-        loss = torch.zeros(())
         for _ in range(epochs):
             order = torch.from_numpy(self._rng.permutation(len(seen)))
-            losses = []
             for rows in order.split(MINIBATCH):
-                loss = self._divergence(seen[rows], told[rows], actions[rows])
                 self._adam.zero_grad()
-                loss.backward()
+                self._divergence(seen[rows], told[rows], actions[rows]).backward()
                 self._adam.step()
-                losses.append(loss.item())
-            loss = torch.tensor(losses).mean()
-        return float(loss)
 
     def _divergence(self, seen: Tensor, told: Tensor, actions: Tensor) -> Tensor:
         """Cross entropy from the bells about the teacher's actions, nats a joint."""

@@ -10,7 +10,7 @@ from pup.files import sha256
 from pup.policy.bundle import CARD
 from pup.policy.shape import Method
 from pup.robot import RobotDescription
-from services.experiment.plan import Fits, Plan, Walk, training
+from services.experiment.plan import Fits, Plan, Walk, meant
 
 FLEET = "presysid-fleet"
 DIAGNOSED = "diagnosed"
@@ -155,9 +155,10 @@ class _Graph:
     def _trained(
         self, name: str, walk: Walk, method: Method, words: str, needs: Mapping[str, str]
     ) -> None:
-        """A policy that is trained as words tell."""
-        told = self._told(method=method, direction=walk.direction, training=words)
-        weight = 20 + training(words).steps / 5000
+        """A policy that is trained as words tell, and as it is where they are silent."""
+        options = meant(words, further="start" in needs)
+        told = self._told(method=method, direction=walk.direction, training=words, options=options)
+        weight = 20 + options["steps"] / 5000 + 8 * options["pattern"]
         self._add(Cell(name, "policy", dict(needs), told, self._given(), weight))
 
     def _shelf(self, walk: Walk, method: Method) -> Path | None:

@@ -1,6 +1,7 @@
 """What an experiment does: which robots, which policies, how many walks."""
 
 import argparse
+import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -64,7 +65,7 @@ class Train:
 
     Attributes:
       fleet: each policy, on the bounds of the fleet.
-      further: what is trained on for one robot; the usual rate would undo a gait.
+      further: what is trained on for one robot.
       diagnosed: what is trained on for the fleet with what its diagnoses share.
     """
 
@@ -100,6 +101,23 @@ def training(words: str) -> argparse.Namespace:
         return parser(_Refusing).parse_args(["train", *told, "--out", "."])
     except InputError as error:
         raise InputError(f"train: {error}") from error
+
+
+def meant(words: str, further: bool) -> dict[str, Any]:
+    """All numbers of a training, those included that words leave as they are usual.
+
+    Args:
+      words: as `training` takes them.
+      further: whether a policy is trained on.
+    """
+    from services.training_options import training_options
+
+    given = training(words)
+    given.start = Path() if further else None
+    told = asdict(training_options(given))
+    for name in ("method", "direction", "seed", "start", "track"):
+        del told[name]
+    return dict(json.loads(json.dumps(told)))
 
 
 @dataclass(frozen=True)
@@ -187,8 +205,9 @@ class Plan:
             raise InputError("walk: a direction stands twice; name each once")
         if any(not walk.methods or walk.robots < 1 for walk in self.walks):
             raise InputError("walk: needs a method and a robot at least")
-        for words in asdict(self.train).values():
-            training(words)
+        for name, words in asdict(self.train).items():
+            if training(words).pattern and name != "fleet":
+                raise InputError(f"train: {name} goes on from a gait; leave --pattern out")
         if unknown := [stage for stage in self.stages if stage not in STAGES]:
             raise InputError(f"stage {unknown[0]!r} is unknown; there are {', '.join(STAGES)}")
         if self.pooled and not (self.presysid.fixed_network and len(self.seeds) > 1):
