@@ -34,7 +34,8 @@ def test_a_walk_without_packets_is_as_long_as_one_through_the_bus(tmp_path: Path
 def test_who_falls_has_come_as_far_as_until_then() -> None:
     policy = NumpyPolicy.load(POLICY, DARWIN)
     fleet = Fleet(DARWIN, [SEED, SEED])
-    same = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    middle = np.add(policy.card.eta_lower, policy.card.eta_upper) / 2
+    same = np.stack([middle, middle])
     told = walk(fleet, policy, same, 2.0, 1 / RATE)
     assert told.distance[0] == told.distance[1]  # the same robot, the same noise
     lame = walk(Fleet(DARWIN, [SEED]), _lame(policy), same[:1], 6.0, 1 / RATE)
