@@ -21,6 +21,7 @@ import torch
 from ray.rllib.core import DEFAULT_MODULE_ID
 
 from pup.errors import InputError
+from pup.locomotion.settings import Direction
 from pup.physics.parameters import robot_space
 from pup.policy.bundle import NumpyPolicy
 from pup.policy.losses import LossWeights, Samples
@@ -361,7 +362,7 @@ def test_a_policy_is_trained_further_with_other_servos(ray_here: None, tmp_path:
 @pytest.mark.parametrize("method", [Method.ROBUST, Method.NOMINAL])
 def test_policies_that_see_no_parameters(ray_here: None, tmp_path: Path, method: Method) -> None:
     """Sideways too, where there is no symmetry."""
-    options = replace(SMALL, method=method, steps=64, direction=training.Direction.SIDEWAYS)
+    options = replace(SMALL, method=method, steps=64, direction=Direction.SIDEWAYS)
     document = job(tmp_path, options)
     assert document["curve"]["mirror"] == [0.0, 0.0]
     run = NumpyPolicy.load(tmp_path / "policy", ROBOT)
