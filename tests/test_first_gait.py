@@ -25,8 +25,7 @@ from pup.locomotion.pattern import TURN, Patterns, PatternSpace
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.locomotion.task import WalkingTask
-from pup.policy.imitation import bell
-from pup.policy.network import ProjectedPolicy, expected
+from pup.policy.network import ProjectedPolicy, bell, expected
 from pup.policy.shape import Method, PolicyShape
 from services import first_gait, training
 from services.training_options import Options
@@ -107,7 +106,7 @@ def test_a_reflex_answers_to_how_the_torso_turned_between_two_readings() -> None
 
 def test_a_bell_has_its_mean_where_the_action_is() -> None:
     actions = torch.tensor([[3.3, 5.0], [7.8, 6.5]])
-    probabilities = bell(actions, BINS)
+    probabilities = torch.softmax(bell(actions, BINS), dim=-2)
     mean = (probabilities * torch.arange(BINS)[:, None]).sum(dim=1)
     torch.testing.assert_close(mean, actions, atol=0.01, rtol=0)
 

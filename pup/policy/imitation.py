@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pup.policy.network import SPREAD, ProjectedPolicy
+from pup.policy.network import ProjectedPolicy, bell
 
 RATE = 1e-3
 MINIBATCH = 1024
@@ -60,10 +60,5 @@ class Imitation:
     def _divergence(self, seen: Tensor, told: Tensor, actions: Tensor) -> Tensor:
         """Cross entropy from the bells about the teacher's actions, nats a joint."""
         log = torch.log_softmax(self.policy(seen, told), dim=-2)
-        return -(bell(actions, log.shape[-2]) * log).sum(dim=-2).mean()
-
-
-def bell(actions: Tensor, bins: int) -> Tensor:
-    """Probabilities of the bins, (n, bins, joints): bells of SPREAD about actions, (n, joints)."""
-    off = torch.arange(bins, dtype=actions.dtype)[:, None] - actions[:, None, :]
-    return torch.softmax(-(off**2) / (2 * SPREAD**2), dim=-2)
+        wanted = torch.softmax(bell(actions, log.shape[-2]), dim=-2)
+        return -(wanted * log).sum(dim=-2).mean()

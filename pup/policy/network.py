@@ -82,7 +82,8 @@ class ProjectedPolicy(torch.nn.Module):
         self.actor = _layers(
             shape.proprioception + shape.eta, shape.hidden, shape.bins * shape.joints, 0.01
         )
-        self.actor[-1].bias.data = _about_the_middle(shape).flatten()
+        middle = torch.full((shape.joints,), (shape.bins - 1) / 2)
+        self.actor[-1].bias.data = bell(middle, shape.bins).flatten()
         self.critic = _layers(shape.proprioception + shape.privileged, shape.hidden, 1, 1.0)
 
     def project(self, parameters: Tensor) -> Tensor:
@@ -144,6 +145,17 @@ def expected(logits: Tensor) -> Tensor:
     return torch.einsum("...bj,b->...j", torch.softmax(logits, dim=-2), order)
 
 
+def bell(about: Tensor, bins: int) -> Tensor:
+    """Logits of bells of SPREAD over the bins, shape (..., bins, joints).
+
+    Args:
+      about: the bin that each joint's bell stands over, shape (..., joints).
+      bins: of a joint.
+    """
+    off = torch.arange(bins, dtype=about.dtype)[:, None] - about[..., None, :]
+    return -(off**2) / (2 * SPREAD**2)
+
+
 def draw(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
     """Draw bins.
 
@@ -168,12 +180,6 @@ def log_probability(log: Tensor, bins: Tensor) -> Tensor:
       bins: shape (n, joints).
     """
     return log.gather(-2, bins[..., None, :]).sum(dim=(-2, -1))
-
-
-def _about_the_middle(shape: PolicyShape) -> Tensor:
-    """Logits of a bell over the bins, alike for all joints, shape (bins, joints)."""
-    off = torch.arange(shape.bins) - (shape.bins - 1) / 2
-    return (-(off**2) / (2 * SPREAD**2))[:, None].repeat(1, shape.joints)
 
 
 def _layers(inputs: int, hidden: Sequence[int], outputs: int, last: float) -> torch.nn.Sequential:
