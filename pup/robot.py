@@ -166,6 +166,11 @@ class RobotDescription:
         """Where the fits of real recordings stand; the file need not exist."""
         return self.folder / "identified.json"
 
+    @property
+    def mirrored(self) -> bool:
+        """Whether the robot has a left-right mirror map."""
+        return all(joint.mirror is not None for joint in self.joints)
+
     def mirror(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """The left-right mirror map: `mirrored = sign * q[..., permutation]`.
 
@@ -177,7 +182,7 @@ class RobotDescription:
         """
         index = {name: i for i, name in enumerate(self.joint_names)}
         partners = [joint.mirror for joint in self.joints if joint.mirror is not None]
-        if len(partners) < len(self.joints):
+        if not self.mirrored:
             raise InputError(
                 f"{self.folder / 'robot.toml'}: robot {self.name!r} has no mirror map; "
                 "give every joint a mirror and a mirror_sign"

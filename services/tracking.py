@@ -3,11 +3,15 @@
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from pup.errors import InputError
+from pup.files import read_json, write_json
 
 OTHERS = ("wandb", "mlflow")
 PROJECT = "pup"
+RUNS = "tracking.json"
+"""The runs' names with others: a training that resumes goes on with them."""
 
 
 def check(track: tuple[str, ...]) -> None:
@@ -48,15 +52,34 @@ class Trackers:
             import wandb
 
             self.run = wandb.init(
-                project=PROJECT, dir=str(self.out), config=self.options, resume="allow"
+                project=PROJECT,
+                dir=str(self.out),
+                config=self.options,
+                id=self._run("wandb") or self._begun("wandb", uuid4().hex),
+                resume="allow",
             )
         if "mlflow" in self.track:
             import mlflow
 
             mlflow.set_experiment(PROJECT)
-            mlflow.start_run()
-            mlflow.log_params(_flat(self.options))
+            known = self._run("mlflow")
+            run = mlflow.start_run(run_id=known)
+            if known is None:
+                self._begun("mlflow", run.info.run_id)
+                mlflow.log_params(_flat(self.options))
         return self
+
+    def _run(self, name: str) -> str | None:
+        """The run that a training which was interrupted told."""
+        file = self.out / RUNS
+        told = read_json(file).get(name) if self.done and file.exists() else None
+        return told if isinstance(told, str) else None
+
+    def _begun(self, name: str, run: str) -> str:
+        file = self.out / RUNS
+        others = read_json(file) if file.exists() else {}
+        write_json(file, {**others, name: run})
+        return run
 
     def tell(self, row: dict[str, Any], iteration: int) -> None:
         """Tell the numbers of an iteration."""

@@ -150,7 +150,9 @@ class _Job:
                 trackers.tell(row, len(self.rows))
                 if self._smoothed(len(self.rows)) > best:
                     best, found = self._smoothed(len(self.rows)), trainer.weights()
-                if time.monotonic() - written > CHECKPOINT_SECONDS:
+                due = time.monotonic() - written > CHECKPOINT_SECONDS
+                # The last checkpoint tells that all is done: it comes after the policy.
+                if due and len(self.rows) < self.iterations:
                     self._write(trainer, found)
                     written, found = time.monotonic(), None
             self._bundle("policy", trainer.weights())
@@ -229,7 +231,7 @@ class _Job:
 
     def _mirror(self, task: WalkingTask) -> MirrorMap | None:
         wanted = self.options.learning.weights.mirror and self.options.direction.symmetric
-        if not wanted:
+        if not wanted or not self.robot.mirrored:
             return None
         names = task.observation_names, task.parameter_names
         return MirrorMap.of(self.robot, *names, bins=task.bins)

@@ -318,6 +318,25 @@ def test_an_interrupted_job_ends_alike(
 
 
 @pytest.mark.ray
+def test_what_is_done_has_a_policy(
+    ray_here: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after its last iteration, before the policy is written: it is not done yet."""
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    write = training.write_bundle
+
+    def killed(folder: Path, *told: object) -> None:
+        if folder.name == "policy":
+            raise KeyboardInterrupt
+        write(folder, *told)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(training, "write_bundle", killed)
+        job(tmp_path)
+    assert job(tmp_path)["done"] and weights_of(tmp_path)
+
+
+@pytest.mark.ray
 def test_a_job_leaves_what_a_robot_and_a_reader_need(ray_here: None, tmp_path: Path) -> None:
     """Bundle, curve and TensorBoard's file; another training can start from the bundle."""
     document = job(tmp_path, replace(SMALL, method=Method.UP))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.errors import InputError
 from pup.locomotion.settings import Direction
 from pup.robot import RobotDescription
 
@@ -78,7 +77,7 @@ class PatternSpace:
         moved = [i for i, s in enumerate(robot.gait.joints.values()) if s.a or s.b]
         partner, self._sign = _mirror(robot)
         self._partner = partner
-        half = [i for i in moved if i <= partner[i]]
+        half = sorted({min(i, partner[i]) for i in moved})
         self._felt = half
         self._waved = half if direction.symmetric else moved
         self._symmetric = direction.symmetric
@@ -112,8 +111,7 @@ class PatternSpace:
 
 def _mirror(robot: RobotDescription) -> tuple[list[int], Array]:
     """Each joint's partner and the sign between them; itself where there is no mirror map."""
-    try:
-        permutation, sign = robot.mirror()
-    except InputError:
+    if not robot.mirrored:
         return list(range(len(robot.joints))), np.ones(len(robot.joints))
+    permutation, sign = robot.mirror()
     return [int(i) for i in permutation], np.asarray(sign, dtype=np.float64)
