@@ -86,6 +86,10 @@ def test_cells_are_done_once_and_again_when_something_changed(
     workshop.done.clear()
     assert do(graph(plan), tmp_path) == {}
     assert workshop.done == ["presysid-r1000"]
+    (tmp_path / CELLS / "presysid-fleet-diagnosed" / FILES / "corrected" / "robot.toml").unlink()
+    workshop.done.clear()
+    assert do(graph(plan), tmp_path) == {}
+    assert workshop.done == ["presysid-fleet-diagnosed"]
 
 
 def test_no_cell_waits_for_one_that_it_does_not_need(workshop: Workshop, tmp_path: Path) -> None:

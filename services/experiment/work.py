@@ -249,7 +249,7 @@ KINDS: dict[str, Callable[[Task], dict[str, Any]]] = {
 }
 LEFT = {
     "presysid": ("bounds.json",),
-    "pooled": ("bounds.json",),
+    "pooled": ("bounds.json", "corrected/robot.toml"),
     "policy": ("policy/policy.json",),
     "landscape": ("simulated.json",),
     "diagnosis": ("diagnosis.json", "corrected/robot.toml"),
