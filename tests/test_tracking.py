@@ -20,7 +20,7 @@ class Others:
         self.runs: dict[str, dict[int, dict[str, float]]] = {}
         self.options: dict[str, list[dict[str, Any]]] = {}
         wandb, mlflow = ModuleType("wandb"), ModuleType("mlflow")
-        wandb.init = self._init  # type: ignore[attr-defined]
+        vars(wandb).update(init=self._init)
         for name in ("start_run", "log_params", "log_metrics"):
             setattr(mlflow, name, getattr(self, f"_{name}"))
         for name in ("set_experiment", "end_run"):
