@@ -48,6 +48,7 @@ class Trackers:
 
         folder = str(self.out / "tensorboard")
         self.board = SummaryWriter(folder, purge_step=self.done + 1, max_queue=1000)
+        runs = self._runs()
         if "wandb" in self.track:
             import wandb
 
@@ -55,31 +56,26 @@ class Trackers:
                 project=PROJECT,
                 dir=str(self.out),
                 config=self.options,
-                id=self._run("wandb") or self._begun("wandb", uuid4().hex),
+                id=runs.setdefault("wandb", uuid4().hex),
                 resume="allow",
             )
         if "mlflow" in self.track:
             import mlflow
 
             mlflow.set_experiment(PROJECT)
-            known = self._run("mlflow")
-            run = mlflow.start_run(run_id=known)
+            known = runs.get("mlflow")
+            runs["mlflow"] = mlflow.start_run(run_id=known).info.run_id
             if known is None:
-                self._begun("mlflow", run.info.run_id)
                 mlflow.log_params(_flat(self.options))
+        if runs:
+            write_json(self.out / RUNS, runs)
         return self
 
-    def _run(self, name: str) -> str | None:
-        """The run that a training which was interrupted told."""
+    def _runs(self) -> dict[str, str]:
+        """The runs of a training that goes on; none of one that begins anew."""
         file = self.out / RUNS
-        told = read_json(file).get(name) if self.done and file.exists() else None
-        return told if isinstance(told, str) else None
-
-    def _begun(self, name: str, run: str) -> str:
-        file = self.out / RUNS
-        others = read_json(file) if file.exists() else {}
-        write_json(file, {**others, name: run})
-        return run
+        told = read_json(file) if self.done and file.exists() else {}
+        return {name: run for name, run in told.items() if isinstance(run, str)}
 
     def tell(self, row: dict[str, Any], iteration: int) -> None:
         """Tell the numbers of an iteration."""
