@@ -1,6 +1,7 @@
 """What can be written behind `pup`."""
 
 import argparse
+import re
 from importlib.metadata import version
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from services.arguments_policies import replay, serve, train, transfer, virtual_
 from services.arguments_recordings import blind, diagnose, export, import_logs, presysid, record
 from services.options import budget, number, out, place, robot_or_darwin
 
+NEGATIVE = re.compile(r"-[\d.][\d.eE+,-]*$")
+"""Numbers between commas of which the first has a minus, as an eta may be; no option begins so."""
+
 
 def parser(
     kind: type[argparse.ArgumentParser] = argparse.ArgumentParser,
@@ -17,7 +21,8 @@ def parser(
     """The whole command line, as a kind of parser; the verb ends up in `name`."""
     whole = kind(
         prog="pup",
-        description="From recordings of a legged robot to bounds of its parameters.",
+        description="From recordings of a legged robot to parameter bounds, a policy that walks, "
+        "and the physics that the simulator left out.",
         epilog="`pup VERB --help` tells the options of a verb. Exit codes: 0 done, 2 bad input, "
         "130 stopped, 1 anything else.",
     )
@@ -46,6 +51,7 @@ def parser(
     ):
         verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
         fill(verb)
+        verb._negative_number_matcher = NEGATIVE  # argparse knows a single number only
         verb.add_argument(
             "--json", action="store_true", help="print one JSON object last on standard output"
         )

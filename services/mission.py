@@ -24,8 +24,9 @@ STEPS = 150_000
 TRIALS = 25
 """Walks until eta is chosen, at most (paper)."""
 LEAST_GAIN = 0.002
-"""Expected of a further walk, as a share of the best's distance: 4 mm of 2 m, by which walks of one
-eta differ. What it costs on landscapes that are harder to search is in docs/results/transfer.md."""
+"""Expected of a further walk, as a share of the best's distance: 6 mm of 3 m, less than walks of
+one eta differ by. What it costs on landscapes that are harder to search is told in
+docs/results/transfer.md."""
 EFFECTS = 2
 """Missing effects unless told otherwise: a robot of twenty joints takes minutes for each."""
 

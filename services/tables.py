@@ -99,6 +99,9 @@ def walk_table(document: dict[str, Any]) -> None:
         f"{document['distance_median']:.2f} m in {document['time_median']:.1f} s, "
         f"{document['upright_share']:.0%} without a fall, {document['aside_median']:.2f} m aside"
     )
+    if document["fitted_eta"]:
+        eta = ",".join(f"{entry:.4f}" for entry in document["fitted_eta"])
+        print(f"eta of the fitted parameters: {eta}")
     print(f"video: {document['video']}, drawn by {document['drawn_by']}")
 
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
-from pup.physics.terms import split_column
+from pup.locomotion.conditioning import fitted_eta
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
-from pup.sysid.result import FittedBounds, read_bounds
+from pup.sysid.result import read_bounds
 from pup.transfer.study import StudySettings
 from services.laboratory import AGENT, Laboratory
 from services.transfer import Gateway, Wanted, transfer
@@ -135,23 +135,6 @@ def follow(
 
     place = laboratory.url, laboratory.token
     return transfer(Wanted(laboratory.policy, name, *place, settings, simulated), out, tell, tend)
-
-
-def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]:
-    """The projection of the fitted parameters, shape (n_eta,).
-
-    An effect that the fitted model has not is one of size zero.
-
-    Raises:
-      InputError: the policy knows parameters that the fitted model does not have.
-    """
-    card = policy.card
-    told = {name: 0.0 for name in card.parameters if split_column(name) is not None}
-    told |= dict(zip(bounds.space.names, map(float, bounds.space.nominal), strict=True))
-    if unknown := [name for name in card.parameters if name not in told]:
-        raise InputError(f"the policy is of a model with {unknown[0]!r}, which the fitted has not")
-    mu = np.array([told[name] for name in card.parameters])
-    return policy.project(card.scale.unit(mu))
 
 
 def recorded(folder: Path) -> list[Path]:

@@ -10,6 +10,7 @@ from scipy.stats import qmc
 
 from pup.errors import InputError
 from pup.files import write_json
+from pup.locomotion.conditioning import fitted_eta
 from pup.locomotion.evaluation import evaluate
 from pup.locomotion.landscape import landscape
 from pup.locomotion.sampling import ParameterSampler
@@ -96,6 +97,7 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
         "method": policy.card.method,
         "direction": policy.card.direction,
         "eta": None if eta is None else eta.tolist(),
+        "fitted_eta": fitted_eta(policy, bounds).tolist() if policy.card.shape.eta else None,
         "shown": {
             "distance": footage.distance,
             "time": float(footage.time[-1]),

@@ -38,3 +38,29 @@ def test_a_joint_that_diverged_is_as_noisy_as_the_others() -> None:
     measured = Maker(RobotDescription.load("darwin_leg")).measured
     told = noise_floor(measured, np.where(measured.channel == 2, np.nan, errors(measured)))
     assert told.sigma[: len(measured.robot.joints)] == pytest.approx(SIGMA, rel=0.35)
+
+
+@pytest.mark.parametrize("joint", [0, 3])
+def test_a_noisier_joint_is_believed_and_a_quieter_one_by_half(joint: int) -> None:
+    """A joint that friction holds flickers less at rest than it does in motion."""
+    assert times_as_noisy(joint, 4.0) == pytest.approx(4.0, rel=0.15)
+    assert times_as_noisy(joint, 0.25) == pytest.approx(np.sqrt((1 + 1 / 16) / 2), rel=0.15)
+
+
+def test_a_joint_that_hardly_says_anything_is_nearly_as_noisy_as_the_others() -> None:
+    assert times_as_noisy(2, 4.0, readings=8) == pytest.approx(np.sqrt((16 + 1) / 2), rel=0.3)
+
+
+def times_as_noisy(joint: int, factor: float, readings: int = 1_000) -> float:
+    """How a joint of a leg is told, in the noise of the others, if it has another noise."""
+    alone = Maker(RobotDescription.load("darwin_leg")).measured
+    first, *others = alone.recordings
+    again = (replace(run, repeat_of=first.id, motion=first.motion) for run in others)
+    measured = replace(alone, recordings=(first, *again))
+    own = np.flatnonzero(measured.channel == joint)
+    made = errors(measured)
+    made[own] *= factor
+    for run in range(len(measured.recordings)):
+        made[own[measured.recording[own] == run][readings:]] = np.nan
+    told = noise_floor(measured, made).sigma[: len(measured.robot.joints)]
+    return float(told[joint] / np.median(np.delete(told, joint)))

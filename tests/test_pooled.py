@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from pup.errors import InputError
 from pup.files import read_json
+from pup.locomotion.conditioning import fitted_eta
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
 from pup.robot_parts import TermSpec
 from pup.robot_writer import write_corrected
 from pup.sysid.pooled import pooled, shared_terms
 from pup.sysid.result import read_bounds
-from services.trials import fitted_eta
 
 DARWIN = RobotDescription.load("darwin_op2")
 

@@ -42,11 +42,15 @@ def test_a_stopped_training_says_so_and_leaves_nothing_running(tmp_path: Path) -
     shown = pup(*walk, "--landscape", 2, "--out", tmp_path / "walk").json()
     assert len(shown["distance"]) == len(shown["fell"]) == 4
     assert shown["shown"]["time"] > 0
+    assert shown["eta"] is None and len(shown["fitted_eta"]) == 3
     assert (tmp_path / "walk" / "gait.png").read_bytes().startswith(b"\x89PNG")
     assert Path(shown["video"]).stat().st_size > 1000
     assert shown["drawn_by"] in ("mujoco", "matplotlib")
     simulated = read_simulated(tmp_path / "walk" / "simulated.json")
     assert np.shape(simulated["eta"]) == (2, 3) and np.shape(simulated["distance"]) == (16, 2)
+    eta = ",".join(map(str, (-0.5, *shown["fitted_eta"][1:])))
+    conditioned = pup(*walk, "--out", tmp_path / "conditioned", "--eta", eta).json()
+    assert conditioned["eta"] == [-0.5, *shown["fitted_eta"][1:]]
     assert pup(*walk, "--out", tmp_path / "other", "--eta", "0,0").code == 2
     leg = ("replay", "--policy", policy, "--robot", "darwin_leg", "--out", tmp_path / "other")
     refused = pup(*leg)

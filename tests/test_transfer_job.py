@@ -54,14 +54,14 @@ SMALL = ("--trials", 4, "--initial", 3, "--repeats", 2)
 def test_a_study_is_followed_to_its_end(robot, tmp_path):
     agent, command = robot
     n_eta = read_bundle(tmp_path / "policy")[0].shape.eta
-    compare = ",".join(["0.5"] * n_eta)
+    compare = ",".join(["-0.5"] * n_eta)  # not taken for an option
     done = pup(*command, *SMALL, "--compare", compare, "--json")
     assert done.code == 0, done.err
     told = done.json()
     assert told == json.loads((tmp_path / "study.json").read_text())
     assert told["schema"] == 1 and told["state"] == "done" and len(told["eta"]) == n_eta
     assert [len(part["distance"]) for part in told["evaluation"]] == [2, 2]
-    assert told["evaluation"][1]["eta"] == [0.5] * n_eta
+    assert told["evaluation"][1]["eta"] == [-0.5] * n_eta
     assert len(told["trials"]) == 8 and len(agent.journal.walked) == 8
     assert {e["kind"] for e in told["history"]} >= {"created", "requested", "assigned", "chosen"}
     assert "4/4 walks" in done.err

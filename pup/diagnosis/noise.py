@@ -1,7 +1,7 @@
 """The noise floor: what differs between repeats of a motion, else what flickers at rest."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -39,6 +39,23 @@ DIGITS = 6
 """Decimals of a radian that readings are told apart by."""
 ON_GRID, MOSTLY = 0.1, 0.9
 """Readings are quantised where so many of them lie within this share of a step of a grid."""
+KIND = 30
+"""A channel is as noisy as its kind until more than so many readings of its own tell more."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What a channel tells of its noise.
+
+    Attributes:
+      sigma: standard deviation, rad.
+      rho: lag-one correlation.
+      readings: that tell no more than noise; 0 where what a model lacks may be among it.
+    """
+
+    sigma: float
+    rho: float
+    readings: int = 0
 
 
 def assumed_noise(measured: Measured) -> Noise:
@@ -61,15 +78,16 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
     """
     pairs = repeats(measured)
     differing = differences(measured, errors)
-    told: dict[int, tuple[float, float]] = {}
+    told: dict[int, Spread] = {}
     readings, late = [], None
     if differing:
         # On the ground, impacts make motions differ everywhere, and no rest tells the noise alone.
         ground = any(measured.recordings[a].support == "ground" for a, _ in pairs)
         late = None if ground else lateness(differing, _least(measured))
-        told = {c: (s, late.rho) for c, s in late.sigma.items()} if late else _spreads(differing)
-        counts = np.bincount([d.channel for d in differing], [len(d.errors) for d in differing])
-        readings = [int(n) for n in counts if n]
+        told = _spreads(differing)
+        readings = [spread.readings for spread in told.values()]
+        if late:
+            told = {c: replace(told[c], sigma=s, rho=late.rho) for c, s in late.sigma.items()}
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
     if not told:
         for channel in range(measured.channels):
@@ -98,7 +116,8 @@ def quiet_noise(measured: Measured, errors: Array) -> Noise:
         kept = [b for b, s in zip(blocks, squares, strict=True) if s < QUIET * np.median(squares)]
         variance = float(np.mean(np.concatenate(kept) ** 2))
         follows = float(np.mean(np.concatenate([b[1:] * b[:-1] for b in kept])))
-        told[channel] = np.sqrt(variance), max(follows / max(variance, 1e-300), 0.0)
+        rho = max(follows / max(variance, 1e-300), 0.0)
+        told[channel] = Spread(float(np.sqrt(variance)), rho)
     return _pooled(measured, told, "assumed", 0)
 
 
@@ -135,11 +154,11 @@ def _blocks(measured: Measured, errors: Array, channel: int) -> list[Array]:
 
 def _pooled(
     measured: Measured,
-    told: dict[int, tuple[float, float]],
+    told: dict[int, Spread],
     source: Literal["repeats", "assumed"],
     readings: int,
 ) -> Noise:
-    """Channels that say nothing take the median of their kind; one kind shares its correlation."""
+    """Channels that say nothing take the median of their kind, which shares its correlation."""
     joints = len(measured.robot.joints)
     noise = assumed_noise(measured)
     least = _least(measured)
@@ -148,18 +167,23 @@ def _pooled(
         known = [told[c] for c in kind if c in told]
         if not known:
             continue
-        middle = float(np.median([s for s, _ in known]))
-        shared = float(np.clip(np.median([r for _, r in known]), 0.0, 0.9))
+        middle = float(np.median([spread.sigma for spread in known]))
+        shared = float(np.clip(np.median([spread.rho for spread in known]), 0.0, 0.9))
         for channel in kind:
-            own = told.get(channel, (middle, shared))[0]
-            # One channel's few samples say less than all of its kind together.
-            sigma[channel] = max(least[channel], np.sqrt((own**2 + middle**2) / 2))
-            rho[channel] = shared
+            own = told.get(channel, Spread(middle, shared))
+            # A channel's few samples say less than all of its kind together, and a joint that
+            # friction holds may be quiet at rest alone; one that is noisier is believed.
+            noisier = own.sigma > middle
+            belief = own.readings / (own.readings + KIND) if noisier else 0.0
+            weight = max(0.5, belief)
+            variance = weight * own.sigma**2 + (1 - weight) * middle**2
+            sigma[channel] = max(least[channel], np.sqrt(variance))
+            rho[channel] = belief * np.clip(own.rho, 0.0, 0.9) + (1 - belief) * shared
     return Noise(sigma, rho, source, readings)
 
 
-def _spreads(differences: Sequence[Difference]) -> dict[int, tuple[float, float]]:
-    """Standard deviation and memory of each channel."""
+def _spreads(differences: Sequence[Difference]) -> dict[int, Spread]:
+    """Noise of each channel, by what differs."""
     by_channel: dict[int, list[Array]] = {}
     for difference in differences:
         by_channel.setdefault(difference.channel, []).append(difference.errors)
@@ -193,10 +217,10 @@ def quanta(measured: Measured) -> Array:
     return steps
 
 
-def _spread(parts: Sequence[Array]) -> tuple[float, float]:
-    """Standard deviation and lag-one correlation of some runs of differences."""
+def _spread(parts: Sequence[Array]) -> Spread:
+    """Noise by some runs of differences."""
     variance, follows = _moments(parts)
-    return float(np.sqrt(variance)), follows / max(variance, 1e-300)
+    return Spread(float(np.sqrt(variance)), follows / max(variance, 1e-300), sum(map(len, parts)))
 
 
 def _moments(parts: Sequence[Array]) -> tuple[float, float]:
@@ -262,7 +286,7 @@ def flutter(measured: Measured, errors: Array, channel: int) -> float | None:
     return _bending(_changes(measured, errors, channel)[1])
 
 
-def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, float] | None:
+def _flicker(measured: Measured, errors: Array, channel: int) -> Spread | None:
     """Noise of a channel, from how its errors flicker while no command changes.
 
     Where commands never rest, the quieter half of all that bends stands for rest; where errors
@@ -273,9 +297,10 @@ def _flicker(measured: Measured, errors: Array, channel: int) -> tuple[float, fl
         variance, follows = _moments(steps)
         rho = max(1 + 2 * follows / max(variance, 1e-300), 0.0)
         if rho <= MEMORY:
-            return float(np.sqrt(variance / (2 * (1 - rho)))), rho
+            sigma = float(np.sqrt(variance / (2 * (1 - rho))))
+            return Spread(sigma, rho, sum(map(len, steps)))
     alone = _bending(bends)
-    return None if alone is None else (alone, 0.0)
+    return None if alone is None else Spread(alone, 0.0, sum(map(len, bends)))
 
 
 def _bending(bends: Sequence[Array]) -> float | None:

@@ -70,8 +70,8 @@ class Train:
     """
 
     fleet: str = ""
-    further: str = "--steps 800000 --learning-rate 2e-4"
-    diagnosed: str = "--steps 3000000 --learning-rate 2e-4"
+    further: str = "--steps 800000"
+    diagnosed: str = "--steps 1500000"
 
 
 class _Refusing(argparse.ArgumentParser):

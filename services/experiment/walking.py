@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from pup.locomotion.conditioning import fitted_eta
 from pup.policy.bundle import NumpyPolicy, read_bundle, write_bundle
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
 from services.experiment.cells import SEARCHED
 from services.laboratory import Laboratory
 from services.transfer import read_simulated
-from services.trials import Budget, fitted_eta, follow
+from services.trials import Budget, follow
 
 STUDY = "run"
 NOTHING = "nothing"
