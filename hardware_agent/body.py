@@ -164,6 +164,7 @@ class Body:
         self.bus.prepare(self.goal, self.settings.safety.late)
         deaf = self.bus.without(self.goal)
         if deaf:
+            self.limp()  # some servos come on by a goal alone
             told = ", ".join(self.names[self.ids.index(number)] for number in deaf[:3])
             return Trip("enable", f"{told} did not take its goal")
         self.bus.torque(True)

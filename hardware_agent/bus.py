@@ -104,6 +104,11 @@ class Bus:
         with suppress(BusError):
             self._port.open()
 
+    @property
+    def descriptor(self) -> int | None:
+        """File descriptor of the port; None while it is closed."""
+        return self._port.descriptor
+
     def take(self) -> None:
         """Open the port and take the bus; nothing is written.
 

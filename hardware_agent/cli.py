@@ -90,6 +90,16 @@ def _say(do: str, **more: Any) -> Any:
     return verb
 
 
+def _stop(options: argparse.Namespace) -> int:
+    told = say(Settings.read(options.config).socket, {"do": "stop"})
+    if not told["limp"]:
+        print(
+            "pup-agent stop: not every servo says that it is limp; use the power switch",
+            file=sys.stderr,
+        )
+    return DONE if told["limp"] else FAILED
+
+
 def _distance(options: argparse.Namespace) -> int:
     say(Settings.read(options.config).socket, {"do": "distance", "distance": options.metres})
     return DONE
@@ -173,7 +183,7 @@ VERBS = {
     "run": _run,
     "enable": _say("enable"),
     "disable": _disable,
-    "stop": _say("stop"),
+    "stop": _stop,
     "health": _health,
     "operate": _operate,
     "arm": _say("arm"),

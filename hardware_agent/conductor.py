@@ -31,6 +31,7 @@ from pup.wire import (
     Finished,
     Outcome,
     Sample,
+    farthest,
 )
 
 SAMPLES = 0.2  # s between two samples
@@ -120,16 +121,26 @@ class Conductor:
         else:
             self._motion.cancel(reason)
 
-    def measured(self, distance: float) -> None:
+    def measured(self, distance: float, trial: str | None = None) -> None:
         """Somebody has measured how far the robot came, in m.
 
+        Args:
+          distance: m.
+          trial: that was measured; None for whichever it is that asks.
+
         Raises:
-          InputError: nobody was asked.
+          InputError: nobody was asked, or no robot comes so far.
         """
-        if self.stage is not Stage.MEASURING or self._future is not None:
+        if self.stage is not Stage.MEASURING or self._future is not None or self._assign is None:
             raise InputError("no distance is asked for now")
-        if not np.isfinite(distance) or abs(distance) > 1000:
-            raise InputError(f"{distance} is no distance in metres")
+        if trial not in (None, self._assign.trial):
+            raise InputError(f"the distance of {self._assign.trial} is asked for, not of {trial}")
+        most = farthest(self._assign.horizon)
+        if not abs(distance) <= most:
+            raise InputError(
+                f"{distance:g} m in {self._assign.horizon:g} s cannot be ({most:g} m at most); "
+                "was it in metres? Tell it again"
+            )
         self._finish(Outcome.SUCCEEDED, self._reason, distance)
 
     def cancelled(self, cancel: Cancel) -> None:

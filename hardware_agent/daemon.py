@@ -55,6 +55,7 @@ TURN = 0.05  # s, the longest sleep of the loop
 RESEND = 2.0  # s between two sendings of an end that is not acknowledged
 TAKEOVER = 5.0  # s that another process may still have the bus
 PATIENCE = 5.0  # s that a command waits for the loop
+CONFIRMED = 1.5  # s in which all servos should have said that they are limp
 MOVING = ("enable", "arm")  # commands that are not done once the robot was stopped
 
 
@@ -105,7 +106,7 @@ class Agent:
         self._stopper: subprocess.Popen[bytes] | None = None
         self._ending = False
         self._beaten = self._resent = 0.0
-        self._seen: AgentState | None = None
+        self._seen: tuple[AgentState, bool] | None = None
 
     def run(self) -> None:
         """Open the robot and serve until told to end; the robot is limp then."""
@@ -153,7 +154,7 @@ class Agent:
         """
         if command.get("do") == "stop":  # before anything that may be busy
             self._stop(str(command.get("reason", "at the robot's computer")))
-            return {}
+            return {"limp": self._limp()}
         if command.get("do") == "health":
             return self.health()
         call = Call(command, self._stops)
@@ -165,6 +166,13 @@ class Agent:
             if call.done.cancel():
                 raise InputError("the agent is busy; nothing was done") from error
             raise InputError("the agent is still at it; `pup-agent health` tells more") from error
+
+    def _limp(self) -> bool:
+        """Whether all servos say, within a while, that they are limp."""
+        end = time.monotonic() + CONFIRMED
+        while not self._motion.status.limp and time.monotonic() < end:
+            time.sleep(0.02)
+        return self._motion.status.limp
 
     def health(self) -> dict[str, Any]:
         """See `hardware_agent.health`."""
@@ -281,7 +289,7 @@ class Agent:
             told = command.get("distance")
             if isinstance(told, bool) or not isinstance(told, int | float):
                 raise InputError("distance is no number of metres")
-            self._conductor.measured(float(told))
+            self._conductor.measured(float(told), command.get("trial"))
         else:
             raise InputError(f"{do!r} is no command of this agent")
 
@@ -311,10 +319,10 @@ class Agent:
     def _beat(self) -> None:
         now = time.monotonic()
         self._warmth.keep(self._motion.status.heat)
-        state = self._motion.status.state
-        changed, self._seen = state is not self._seen, state
-        if changed:
+        state, limp = self._motion.status.state, self._motion.status.limp
+        if self._seen is None or state is not self._seen[0]:
             log.info("%s %s", state, self._motion.status.reason)
+        changed, self._seen = self._seen != (state, limp), (state, limp)
         if now - self._motion.status.tick < 2.0 or not self._motion.status.bus:
             notify("WATCHDOG=1", f"STATUS={state} {self._motion.status.reason}")
         if self._link is None:

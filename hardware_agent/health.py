@@ -46,6 +46,7 @@ def health(
             "period_longest": _number(status.timing.longest),
         },
         "bus": {"works": status.bus, "repeated": status.repeated, "lost": status.lost},
+        "limp": status.limp,
         "watchdog": watchdog,
         "link": link,
         "limited": status.limited,
@@ -74,6 +75,11 @@ def _problems(
         problems.append(f"the control loop has not ticked for {silent:.1f} s")
     if status.bus and status.state is AgentState.FAULT:
         problems.append(status.reason)
+    senses = status.senses
+    if senses is not None and senses.has_imu:
+        silent = senses.time - senses.imu_seen
+        if silent > max(SILENT, settings.safety.stale):
+            problems.append("the IMU does not answer, or tells nothing that can be")
     if status.doubted:
         told = ", ".join(status.doubted[:3])
         more = f" and {len(status.doubted) - 3} more" if len(status.doubted) > 3 else ""

@@ -239,7 +239,9 @@ class Bno055:
                 self._wire.ask(FIRST, LENGTH)
         except FAILURES as error:
             raise BusError(f"{self._settings.port}: {device_error(error)}") from error
-        return self._read(data)
+        # A chip that was reset, by a supply that broke down, tells zeros until it is configured:
+        # upright and quiet, whatever the robot does. One that works feels at least gravity.
+        return self._read(data) if any(data[:6]) else None
 
     def _read(self, data: bytes) -> Orientation:
         counts = np.frombuffer(data, "<i2").astype(np.float64)

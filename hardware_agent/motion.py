@@ -381,6 +381,7 @@ class Motion(threading.Thread):
             limited=self._limited,
             heat=self._body.guard.heat,
             doubted=self._body.long_doubted,
+            limp=self._bus and not self._body.torque and not self._body.doubted,
         )
 
     def _realtime(self) -> None:

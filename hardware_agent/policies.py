@@ -1,5 +1,7 @@
 """The policy bundles that lie on the robot's computer."""
 
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 from pup.errors import InputError
@@ -7,6 +9,8 @@ from pup.files import sha256
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.wire import Policy
+
+log = logging.getLogger("pup-agent")
 
 
 def digest_of(bundle: Path) -> str:
@@ -34,8 +38,8 @@ class Shelf:
         self._loaded: tuple[str, NumpyPolicy] | None = None
 
     def policies(self) -> tuple[Policy, ...]:
-        """All that are there, by name."""
-        return tuple(Policy(path.name, digest_of(path)) for path in self._bundles())
+        """All that are there and can be read, by name."""
+        return tuple(Policy(path.name, digest) for path, digest in self._readable())
 
     def load(self, digest: str) -> NumpyPolicy:
         """A policy; the last one is kept.
@@ -45,13 +49,20 @@ class Shelf:
         """
         if self._loaded is not None and self._loaded[0] == digest:
             return self._loaded[1]
-        for path in self._bundles():
-            if digest_of(path) == digest:
+        for path, found in self._readable():
+            if found == digest:
                 self._loaded = digest, NumpyPolicy.load(path, self._robot)
                 return self._loaded[1]
         raise InputError(
             f"{self._folder}: no policy with digest {digest[:16]}; copy its bundle here"
         )
+
+    def _readable(self) -> Iterator[tuple[Path, str]]:
+        for path in self._bundles():
+            try:
+                yield path, digest_of(path)
+            except InputError as error:  # a file that was badly copied must end no walk
+                log.warning("%s; left out", error)
 
     def _bundles(self) -> list[Path]:
         if (self._folder / CARD).is_file():

@@ -59,6 +59,11 @@ class Port(PortHandler):  # type: ignore[misc]  # the SDK has no types
         with contextlib.suppress(*FAILURES, ValueError, NotImplementedError):
             self.ser.set_low_latency_mode(True)  # 1 ms instead of 16 on USB adapters of FTDI
 
+    @property
+    def descriptor(self) -> int | None:
+        """Its file descriptor; None while it is closed."""
+        return int(self.ser.fileno()) if self.is_open else None
+
     def claim(self, wait: bool = False) -> None:
         """Become the owner: nobody else who asks can, until this process closes it or ends.
 

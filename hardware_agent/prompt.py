@@ -2,42 +2,66 @@
 
 import os
 import select
+import signal
 import sys
 import termios
 import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NoReturn
 
 from hardware_agent.control import say
 from pup.errors import InputError
 
 LOOK = 0.2  # s between two looks at the agent
-HELP = "SPACE or any other key STOPS the robot; e enables, d disables, q leaves (the agent goes on)"
+HELP = (
+    "SPACE or any other key, Ctrl-C too, STOPS the robot; e enables, d disables, q leaves "
+    "(the agent goes on)"
+)
+ASKED = "distance in m, then ENTER (nothing: the trial does not count); other keys STOP: "
 MOVING = ("posing", "placing", "settling", "running")
+ENTER, RUBOUT = ("\n", "\r"), ("\x7f", "\b")
+
+
+class LeftError(Exception):
+    """The terminal is gone, and with it whoever could stop the robot."""
 
 
 def operate(socket: Path) -> int:
     """Talk to the agent until the operator leaves.
 
+    A robot that moves when the terminal is lost is stopped: nobody could any more.
+
     Args:
       socket: of the agent.
+
+    Returns:
+      0 where the operator left, 1 where the terminal did.
 
     Raises:
       InputError: no agent answers, or this is no terminal.
     """
     if not sys.stdin.isatty():
         raise InputError("this is no terminal; use `pup-agent arm`, `stop` and `distance`")
-    while True:
+    before = {n: signal.signal(n, _leave) for n in (signal.SIGHUP, signal.SIGTERM)}
+    try:
         with _keys():
             print(HELP, flush=True)
-            if not _watch(socket):
-                return 0
-        _measure(socket)
+            while trial := _watch(socket):
+                _measure(socket, trial)
+        return 0
+    except (LeftError, OSError):
+        if say(socket, {"do": "health"})["stage"] in MOVING:
+            say(socket, {"do": "stop", "reason": "the operator's terminal is gone"})
+        return 1
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def _watch(socket: Path) -> bool:
-    """Show what happens and do what keys say; True for a distance to type, False to leave."""
+def _watch(socket: Path) -> str:
+    """Show what happens and do what keys say; the trial whose distance to type, none to leave."""
     shown = ""
     while True:
         told = say(socket, {"do": "health"})
@@ -49,35 +73,54 @@ def _watch(socket: Path) -> bool:
             if asked == "arm":
                 print("ENTER starts the trial, s skips it")
         if asked == "distance":
-            return True
+            return str(told["trial"])
         key = _key()
-        if key and _press(socket, key, asked):
-            return False
+        if key == "q":
+            return ""
+        if key:
+            _press(socket, key, asked)
 
 
-def _press(socket: Path, key: str, asked: str) -> bool:
-    """Do what a key means; True to leave."""
+def _press(socket: Path, key: str, asked: str) -> None:
+    """Do what a key means."""
     meaning = {"e": "enable", "d": "disable"}
     if asked == "arm":
-        meaning |= {"\n": "arm", "\r": "arm", "s": "skip"}
-    if key == "q":
-        return True
+        meaning |= dict.fromkeys(ENTER, "arm") | {"s": "skip"}
+    do = meaning.get(key, "stop")
     try:
-        say(socket, {"do": meaning.get(key, "stop"), "reason": "by the operator"})
+        told = say(socket, {"do": do, "reason": "by the operator"})
     except InputError as error:
         print(error)
-    return False
-
-
-def _measure(socket: Path) -> None:
-    try:
-        typed = input("distance in m (nothing: the trial does not count): ").strip()
-    except EOFError:  # Ctrl-D; it is asked for again
-        print()
         return
+    if do == "stop" and not told["limp"]:
+        print("NOT EVERY SERVO SAYS THAT IT IS LIMP: use the power switch")
+
+
+def _measure(socket: Path, trial: str) -> None:
+    """Let a distance be typed; a key that is no part of one stops the robot, as ever."""
+    print(ASKED, end="", flush=True)
+    typed = ""
+    while (key := _key()) not in ENTER:
+        if not key:
+            told = say(socket, {"do": "health"})
+            if told["waiting"] != "distance" or told["trial"] != trial:  # told elsewhere
+                print()
+                return
+        elif key in "0123456789.,-+":
+            typed += key
+            print(key, end="", flush=True)
+        elif key in RUBOUT:
+            typed = typed[:-1]
+            print("\b \b", end="", flush=True)
+        else:
+            print()
+            _press(socket, " ", "")
+            print(f"{ASKED}{typed}", end="", flush=True)
+    print()
     try:
         if typed:
-            say(socket, {"do": "distance", "distance": float(typed.replace(",", "."))})
+            metres = float(typed.replace(",", "."))
+            say(socket, {"do": "distance", "distance": metres, "trial": trial})
         else:
             say(socket, {"do": "skip", "reason": "not measured"})
     except (InputError, ValueError) as error:
@@ -85,17 +128,38 @@ def _measure(socket: Path) -> None:
 
 
 def _key() -> str:
-    """A key that is pressed within a moment; empty for none."""
+    """A key that is pressed within a moment; empty for none.
+
+    Raises:
+      LeftError: the terminal is gone.
+    """
     ready, _, _ = select.select([sys.stdin.fileno()], [], [], LOOK)
-    return os.read(sys.stdin.fileno(), 1).decode(errors="replace") if ready else ""
+    if not ready:
+        return ""
+    read = os.read(sys.stdin.fileno(), 1)
+    if not read:
+        raise LeftError
+    return read.decode(errors="replace")
+
+
+def _leave(*_: object) -> NoReturn:
+    raise LeftError
 
 
 @contextmanager
 def _keys() -> Iterator[None]:
-    """Keys come one by one, as they are pressed: none must get lost that should stop the robot."""
+    """Keys come one by one, as they are pressed, Ctrl-C, Ctrl-Z and Ctrl-S among them.
+
+    None must get lost that should stop the robot.
+    """
     before = termios.tcgetattr(sys.stdin)
     try:
         tty.setcbreak(sys.stdin)
+        now = termios.tcgetattr(sys.stdin)
+        now[0] &= ~termios.IXON
+        now[3] &= ~(termios.ISIG | termios.IEXTEN)
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, now)
         yield
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        with suppress(termios.error):  # of a terminal that is gone
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hardware_agent.flight import FlightRecorder
 from hardware_agent.rollout import recording_id, recording_of
 from hardware_agent.trials import RESTARTED, End
+from pup.errors import InputError
 from pup.files import sha256
 from pup.robot import RobotDescription
 from pup.wire import CHUNK, Assign, Body, Finished, Outcome, RecordingChunk
@@ -34,7 +35,7 @@ class Recordings:
         self.flight = FlightRecorder(state / "walk", robot.joint_names)
 
     def keep(self, assign: Assign, rows: Array, reason: str) -> Kept | None:
-        """Write the recording of a walk; None where there was no motion, or the disk is full.
+        """Write the recording of a walk; None where there was no motion, or it cannot be written.
 
         Args:
           assign: the trial.
@@ -45,13 +46,13 @@ class Recordings:
             return None
         notes = f"eta {list(assign.eta)}; policy {assign.policy}; {reason}"
         joints = self._robot.joint_names
-        made = recording_of(assign, rows, joints, self._robot.name, self._source, notes)
-        file = self._file(made.id)
-        try:
+        try:  # a full disk, or rows that a power cut has spoilt: the walk counts all the same
+            made = recording_of(assign, rows, joints, self._robot.name, self._source, notes)
+            file = self._file(made.id)
             made.write(file)
             return made.id, sha256(file)
-        except OSError as error:  # the walk counts all the same
-            log.error("recording %s is lost: %s", made.id, error)
+        except (OSError, InputError) as error:
+            log.error("recording of %s is lost: %s", assign.trial, error)
             return None
 
     def salvage(self, assign: Assign) -> End:

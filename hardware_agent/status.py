@@ -26,6 +26,7 @@ class MotionStatus:
       limited: what held the latest target back, by joint.
       heat: of the hottest winding (I²t), as a share of what is allowed.
       doubted: joints whose servos have long not told that their torque is off, though it should be.
+      limp: whether every servo has told that its torque is off since it was to be.
     """
 
     state: AgentState
@@ -39,6 +40,7 @@ class MotionStatus:
     limited: dict[str, str]
     heat: float
     doubted: tuple[str, ...] = ()
+    limp: bool = False
 
 
 def brief(text: str) -> str:

@@ -19,6 +19,10 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # imported where it is needed: the process is small, and starts at once
+    from hardware_agent.bus import Bus
 
 ON, OFF, READY, ENDED = b"1", b"0", b"r", b"e"
 PERSISTENCE = 2.0  # s, of trying to make the robot limp
@@ -85,22 +89,36 @@ class Watchdog:
         self._process.wait(timeout=10.0)
 
 
-def watch(beats: socket.socket, agent: int, timeout: float) -> str:
+def watch(beats: socket.socket, agent: int, timeout: float, bus: "Bus") -> str:
     """Wait until the agent is gone, by itself or by us.
 
     Args:
       beats: the end of the socket pair.
       agent: file descriptor of its process.
       timeout: see Watchdog.
+      bus: attached; a port that hangs up is let go, for an adapter that is plugged in again gets
+        its name only once nobody holds the old one.
 
     Returns:
       What happened, in words.
     """
     torque = False
+    poll = select.poll()
+    for descriptor in (beats.fileno(), agent):
+        poll.register(descriptor, select.POLLIN)
+    port = bus.descriptor
+    if port is not None:
+        poll.register(port, 0)  # a hang-up is told in any case
     while True:
-        ready, _, _ = select.select([beats.fileno(), agent], [], [], timeout if torque else None)
+        ready = {descriptor for descriptor, _ in poll.poll(1000 * timeout if torque else None)}
         if agent in ready:
             return "the agent has ended"
+        if port in ready:
+            poll.unregister(port)
+            bus.close()
+            port = None
+            if beats.fileno() not in ready:
+                continue
         if not ready:
             signal.pidfd_send_signal(agent, signal.SIGKILL)
             select.select([agent], [], [])
@@ -170,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bus = Bus(BusSettings(options.port, options.baud, options.protocol), ids)
     bus.attach()
     beats.send(READY)
-    told = watch(beats, agent, options.timeout)
+    told = watch(beats, agent, options.timeout, bus)
     bus.take_over()
     safe = make_limp(bus)
     print(f"watchdog: {told}; {'torque is off' if safe else 'no servo answered'}", file=sys.stderr)

@@ -24,6 +24,7 @@ from pup.wire_values import pack, plain, read, unpack
 
 VERSION = 1
 CHUNK = 2**18  # bytes of a recording in one message
+FASTEST = 5.0  # m/s
 
 
 class AgentState(StrEnum):
@@ -68,6 +69,15 @@ class Progress(StrEnum):
     SUCCEEDED = "succeeded"
     ABORTED = "aborted"
     INFEASIBLE = "infeasible"
+
+
+def farthest(horizon: float) -> float:
+    """Distance beyond which a measurement is a mistake, in centimetres say, m.
+
+    Args:
+      horizon: longest walk, s.
+    """
+    return FASTEST * horizon
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ class FakeAgent:
         self.journal = journal or Journal()
         self.walk, self.address, self.beat, self.pause = walk, address, beat, pause
         self.state = AgentState.ENABLED
-        self.deaf = False
+        self.deaf, self.limp = False, True
         self.received: list[Body] = []
         self.refused: list[tuple[str, int, int]] = []
         self._fence: dict[str, int] = {}
@@ -124,7 +124,8 @@ class FakeAgent:
                 greeted = False
                 continue
             if now - beaten > self.beat:
-                self._send(Heartbeat(self.name, self.state, {"temperature": 41.5, "voltage": 12.1}))
+                health = {"temperature": 41.5, "voltage": 12.1, "limp": self.limp}
+                self._send(Heartbeat(self.name, self.state, health))
                 beaten = now
             if now - resent > 4 * self.beat:
                 self._resend()

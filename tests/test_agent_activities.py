@@ -8,11 +8,13 @@ import pytest
 from agents import DARWIN, bundle, standing
 
 from hardware_agent.activities import WATCHED, Activity, Event, Hold, Settle, Walk
-from hardware_agent.config import ControlSettings
-from hardware_agent.imu import Orientation
+from hardware_agent.config import ControlSettings, ImuSettings
+from hardware_agent.imu import Bno055, Orientation
 from hardware_agent.policies import Shelf
-from hardware_agent.rollout import Rollout
+from hardware_agent.recordings import Recordings
+from hardware_agent.rollout import Rollout, row_names
 from hardware_agent.senses import Senses
+from pup.policy.bundle import CARD
 from pup.wire import Assign
 
 PERIOD = 1 / 33
@@ -47,6 +49,41 @@ def rollout(tmp_path: Path) -> Rollout:
     bundle(tmp_path / "policies" / "still", standing())
     shelf = Shelf(tmp_path / "policies", DARWIN)
     return Rollout(shelf.load(shelf.policies()[0].sha256), (0.0, 0.0, 0.0), 33)
+
+
+def test_a_bundle_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
+    bundle(tmp_path / "policies" / "still", standing())
+    (tmp_path / "policies" / "broken" / CARD).mkdir(parents=True)
+    shelf = Shelf(tmp_path / "policies", DARWIN)
+    (told,) = shelf.policies()
+    assert told.name == "still" and shelf.load(told.sha256)
+
+
+def test_a_recording_that_cannot_be_made_ends_nothing(tmp_path: Path) -> None:
+    """Of a walk whose file a power cut has left full of zeros, say."""
+    recordings = Recordings(tmp_path, DARWIN, "hardware")
+    walk = Assign("study", "t", 1, 1, "p" * 64, (0.0,) * 3, 14.0)
+    assert recordings.keep(walk, np.zeros((3, len(row_names(DARWIN.joint_names)))), "") is None
+
+
+def test_an_imu_that_was_reset_tells_nothing() -> None:
+    """All its registers are zero then, as if the robot stood upright and quiet."""
+
+    class Registers:
+        def __init__(self, data: bytes) -> None:
+            self.data = data
+
+        def ask(self, register: int, length: int) -> None:
+            pass
+
+        def take(self, length: int) -> bytes:
+            return self.data
+
+    settings = ImuSettings()
+    gravity = bytes(4) + (981).to_bytes(2, "little") + bytes(18)
+    assert Bno055(settings, Registers(bytes(24))).take(None, 0.0) is None
+    told = Bno055(settings, Registers(gravity)).take(None, 0.0)
+    assert told is not None and np.linalg.norm(told.accel) == pytest.approx(9.81)
 
 
 def test_a_walk_is_timed_the_same_whenever_its_agent_started(rollout: Rollout) -> None:

@@ -1,6 +1,7 @@
 """What an agent must not do: come to life late, leave a servo holding, end for a typo."""
 
 import json
+import os
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from agents import Lab, bundle, lab, standing, wait
+from agents import Lab, bundle, children, lab, standing, wait
 from far_end import Gateway
 from test_agent import assign, at_work
 
@@ -24,6 +25,12 @@ pytest.importorskip("mujoco")
 
 def holding(made: Lab) -> int:
     return int(made.side(cmd="bus")["holding"])
+
+
+def held(pid: int) -> list[str]:
+    """Terminals that a process has open."""
+    places = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()]
+    return [place for place in places if place.startswith("/dev/pts/")]
 
 
 def enabled(made: Lab) -> None:
@@ -97,7 +104,10 @@ def test_a_stop_of_the_gateway_waits_for_nothing_that_was_asked(tmp_path: Path) 
 def test_the_watchdog_finds_an_adapter_that_was_out_and_in_again(tmp_path: Path) -> None:
     with lab(tmp_path) as made:
         made.start()
+        assert made.agent is not None
+        (watchdog,) = (c for c in children(made.agent.pid) if held(c))
         pull_port(made)
+        wait(lambda: not held(watchdog), 10, made.log)  # its name is free for the next
         plug_port(made)
         enabled(made)
         assert holding(made) == 20
@@ -112,11 +122,13 @@ def test_servos_whose_cable_was_out_are_made_limp_when_it_is_back(tmp_path: Path
         made.side(cmd="fault", kind="bus_pulled")
         made.until("fault")
         assert holding(made) == 20, "they have not heard of it"
+        assert made.say("stop")["limp"] is made.health()["limp"] is False
         wait(lambda: "not known to be limp" in str(made.health()["problems"]), 10, made.log)
         made.side(cmd="fault", kind="bus_pulled", off=True)
         wait(lambda: holding(made) == 0, 10, made.log)
         made.say("disable")
         wait(lambda: made.health()["problems"] == [], 10, lambda: str(made.health()))
+        assert made.say("stop")["limp"] is made.health()["limp"] is True
 
 
 def test_whoever_enables_a_robot_that_walks_is_refused_and_it_walks_on(tmp_path: Path) -> None:

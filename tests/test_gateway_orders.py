@@ -118,9 +118,12 @@ def test_a_stop_is_sent_each_time_and_until_it_is_obeyed(service):
         agent.state, agent.deaf = AgentState.ENABLED, True
         until(lambda: _agent(http, "deaf")["state"] == "enabled")
         answer = http.post("/v1/agents/deaf:stop", json={"reason": "smoke"})
-        assert answer.status_code == 409 and "not said that it stopped" in answer.text
+        assert answer.status_code == 409 and "not said that it is limp" in answer.text
         agent.deaf = False
         until(lambda: agent.state is AgentState.STOPPED, 10)
+        agent.limp = False  # its bus is cut: the servos hold, whatever it was told
+        answer = http.post("/v1/agents/deaf:stop", json={"reason": "smoke"})
+        assert answer.status_code == 409 and "use the switch" in answer.text
 
 
 def test_a_stop_does_not_wait_for_the_database_and_a_program_does(service):

@@ -1,6 +1,7 @@
 """Trials and studies: what may follow what, under any order of reports, repeats and losses."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -34,8 +35,8 @@ AFTER = {
     S.RUNNING: {S.SUCCEEDED, S.ABORTED, S.INFEASIBLE, S.LOST},
     S.ABORTED: {S.REQUESTED},
     S.LOST: {S.REQUESTED},
-    S.SUCCEEDED: set(),
-    S.INFEASIBLE: set(),
+    S.SUCCEEDED: {S.ABORTED},  # made void
+    S.INFEASIBLE: {S.ABORTED},
 }
 """What may follow a state; reports may have been lost in between."""
 
@@ -56,7 +57,8 @@ events = st.one_of(
     st.tuples(st.just("release")),
     st.tuples(st.just("assign"), st.sampled_from(["darwin-1", "darwin-2"]), st.integers(0, 6)),
     st.tuples(st.just("report"), tickets, st.sampled_from([S.ARMED, S.RUNNING])),
-    st.tuples(st.just("finish"), tickets, results),
+    st.tuples(st.just("finish"), tickets, results, st.just(15.0)),
+    st.tuples(st.just("void"), st.sampled_from(["mistyped", "held"])),
     st.tuples(st.just("expire")),
     st.tuples(st.just("withdraw"), st.just("")),
     st.tuples(st.just("retry"), st.integers(1, 4)),
@@ -77,6 +79,7 @@ def test_no_history_breaks_a_rule(history):
             assert trial == before, "only what counts changes a trial"
         if trial.state is not before.state:
             assert trial.state in AFTER[before.state]
+            assert before.state not in TOLD or name == "void", "only an operator makes void"
         if name == "assign":
             assert trial.fence > max(fences), "a fence only grows"
             fences.append(trial.fence)
@@ -106,16 +109,16 @@ def test_reports_in_any_order_lead_to_running(order):
 
 def test_a_result_counts_once_and_the_first_one():
     trial, ticket = handed_out()
-    trial, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7))
+    trial, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7), 15.0)
     assert verdict is Verdict.COUNTED
-    again, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.1))
+    again, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.1), 15.0)
     assert verdict is Verdict.REPEATED and again == trial and trial.result.distance == 0.7
 
 
 def test_a_result_after_the_lease_is_late():
     trial, ticket = handed_out()
     trial = trial.expire()
-    after, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7))
+    after, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7), 15.0)
     assert verdict is Verdict.LATE and after.state is S.LOST
 
 
@@ -123,7 +126,7 @@ def test_a_result_of_an_earlier_attempt_is_late_whatever_the_newer_one_does():
     trial, ticket = handed_out()
     trial = trial.expire().retry(2)
     for now in (trial, trial.assign("darwin-2", 4)):
-        after, verdict = now.finish(ticket, Result(S.SUCCEEDED, 0.7))
+        after, verdict = now.finish(ticket, Result(S.SUCCEEDED, 0.7), 15.0)
         assert verdict is Verdict.LATE and after == now
 
 
@@ -132,13 +135,13 @@ def test_a_result_of_an_earlier_attempt_is_late_whatever_the_newer_one_does():
 )
 def test_results_of_what_was_never_handed_out_are_unknown(ticket):
     trial, _ = handed_out()
-    assert trial.finish(ticket, Result(S.SUCCEEDED, 0.7)) == (trial, Verdict.UNKNOWN)
+    assert trial.finish(ticket, Result(S.SUCCEEDED, 0.7), 15.0) == (trial, Verdict.UNKNOWN)
 
 
-@pytest.mark.parametrize("distance", [None, 1e9, -1e300, float("nan")])
+@pytest.mark.parametrize("distance", [None, 312.0, -1e300, float("nan")])  # 3.12 m in cm
 def test_a_success_without_a_distance_that_can_be_is_no_data_point(distance):
     trial, ticket = handed_out()
-    trial, _ = trial.finish(ticket, Result(S.SUCCEEDED, distance))
+    trial, _ = trial.finish(ticket, Result(S.SUCCEEDED, distance), 15.0)
     assert trial.state is S.ABORTED and "distance" in trial.result.reason
 
 
@@ -183,7 +186,7 @@ def play(settings, outcomes):
         trial = Trial("s", len(study.trials) + 1, eta, purpose).release().assign("a", fence)
         study = study.with_trial(trial)
         assert isinstance(next_step(study), Wait), "one trial at a time"
-        trial, _ = trial.finish(Ticket(1, fence, "a"), next(outcomes))
+        trial, _ = trial.finish(Ticket(1, fence, "a"), next(outcomes), 15.0)
         study = study.with_trial(trial)
         made.append(trial)
     raise AssertionError("a study does not end")
@@ -231,7 +234,7 @@ def test_failures_in_a_row_are_counted():
     ends = [S.SUCCEEDED, S.ABORTED, S.ABORTED]
     for number, state in enumerate(ends, 1):
         trial = fresh(number).release().assign("a", number)
-        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0))
+        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0), 15.0)
         study = study.with_trial(trial)
     assert study.failures() == 2
 
@@ -241,14 +244,43 @@ def test_a_retried_trial_that_fails_again_pauses_its_study():
     study = Study("s", SETTINGS)
     for number, state in enumerate([S.ABORTED, S.SUCCEEDED, S.SUCCEEDED], 1):
         trial = fresh(number).release().assign("a", number)
-        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0))
+        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0), 15.0)
         study = study.with_trial(trial)
     assert study.failures() == 0
     study = orders.retry(study, 1, 2)
     trial = study.trial(1).assign("a", 9)
-    trial, _ = trial.finish(Ticket(2, 9, "a"), Result(S.ABORTED, reason="fell asleep"))
+    trial, _ = trial.finish(Ticket(2, 9, "a"), Result(S.ABORTED, reason="fell asleep"), 15.0)
     study = orders.after_end(study.with_trial(trial), trial)
     assert study.state is StudyState.PAUSED and "trial 1 was aborted" in study.reason
+
+
+def walked(*states: S) -> Study:
+    study = Study("s", SETTINGS)
+    for number, state in enumerate(states, 1):
+        trial = fresh(number).release().assign("a", number)
+        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0), 15.0)
+        study = orders.after_end(study.with_trial(trial), trial)
+    return study
+
+
+def test_a_walk_that_shall_not_count_is_void_until_an_eta_was_chosen_by_it():
+    study = walked(S.SUCCEEDED, S.SUCCEEDED)
+    void = orders.void(study, 1, "the tape was read wrongly")
+    assert void.state is StudyState.PAUSED and [t.number for t in void.told] == [2]
+    assert orders.void(orders.resume(void), 1, "the tape was read wrongly") == orders.resume(void)
+    again = orders.retry(void, 1, 2)
+    assert again.trial(1).attempt == 2 and again.state is StudyState.ACTIVE
+    with pytest.raises(TrialError, match="nothing to make void"):
+        orders.void(again, 1, "once more")
+    with pytest.raises(TrialError, match="has chosen by trial"):
+        orders.void(replace(study, chosen=(0.0,) * 3), 1, "too late")
+
+
+def test_a_study_that_no_robot_can_walk_pauses():
+    assert walked(S.INFEASIBLE, S.INFEASIBLE).state is StudyState.ACTIVE
+    study = walked(S.INFEASIBLE, S.INFEASIBLE, S.INFEASIBLE)
+    assert study.state is StudyState.PAUSED and "the last 3 trials" in study.reason
+    assert walked(S.INFEASIBLE, S.SUCCEEDED, S.INFEASIBLE).state is StudyState.ACTIVE
 
 
 @pytest.mark.parametrize(

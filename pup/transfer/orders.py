@@ -12,6 +12,9 @@ from pup.transfer.study import (
     TrialState,
 )
 
+HOPELESS = 3
+"""Trials in a row of which none walked, after which an infeasible one pauses a study."""
+
 
 def release(study: Study, number: int) -> Study:
     """Let a trial pass the gate."""
@@ -28,6 +31,22 @@ def retry(study: Study, number: int, attempt: int) -> Study:
     if retried == trial:
         return study
     return replace(study, state=StudyState.ACTIVE, reason="").with_trial(retried)
+
+
+def void(study: Study, number: int, reason: str) -> Study:
+    """Let a walk not count after all; it may be retried.
+
+    Raises:
+      TrialError: it has no result, or an eta was chosen by it.
+    """
+    _not_done(study)
+    trial = study.trial(number)
+    if study.chosen is not None and trial in study.searched:
+        raise TrialError(f"study {study.name} has chosen by trial {trial.id}; begin another study")
+    voided = trial.void(reason)
+    if voided == trial:
+        return study
+    return pause(study.with_trial(voided), f"trial {number}: {reason}")
 
 
 def pause(study: Study, reason: str) -> Study:
@@ -63,10 +82,16 @@ def halt(study: Study, agent: str, reason: str) -> Study:
 def after_end(study: Study, last: Trial) -> Study:
     """Pause a study whose trials keep giving no result, or whose retried trial gave none.
 
+    So is one whose etas all make the policy ask for what no robot can do.
+
     Args:
       study: with the trial.
       last: that has just ended.
     """
+    hopeless = last.state is TrialState.INFEASIBLE and study.infeasible() >= HOPELESS
+    if hopeless and study.state is StudyState.ACTIVE:
+        told = f"no robot could do what the last {study.infeasible()} trials asked for"
+        return pause(study, f"{told}; is the policy whole? Resume to go on")
     active = study.state is StudyState.ACTIVE and last.state not in TOLD
     again = last.attempt > 1 and last.number < len(study.trials)
     if not active or (study.failures() < study.settings.failures and not again):

@@ -9,8 +9,8 @@ one walk twice:
 
 - a trial is handed out with a fencing token, `fence`, that only grows; reports with another one
   change nothing;
-- a trial that ended stays as it ended; a result that comes after its lease ran out is late: it is
-  kept and flagged, but never counts;
+- a trial that ended stays as it ended, unless an operator makes it void; a result that comes
+  after its lease ran out is late: it is kept and flagged, but never counts;
 - a trial that was aborted or lost is attempted again only when an operator says so.
 """
 
@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from pup.errors import InputError
+from pup.wire import farthest
 
 Eta = tuple[float, ...]
 
@@ -53,9 +54,6 @@ HANDED_OUT = (S.ASSIGNED, S.ARMED, S.RUNNING)
 OPEN = (S.REQUESTED, *HANDED_OUT)
 TOLD = (S.SUCCEEDED, S.INFEASIBLE)
 """What the Gaussian process hears of."""
-
-FARTHEST = 1000.0
-"""Distance beyond which a measurement is a mistake, m."""
 
 
 class Purpose(StrEnum):
@@ -266,13 +264,19 @@ class Trial:
             return self, Verdict.REPEATED
         return replace(self, state=state), Verdict.COUNTED
 
-    def finish(self, ticket: Ticket, result: Result) -> tuple["Trial", Verdict]:
-        """Hear how it ended. A success without a distance that can be is no result of eta."""
+    def finish(self, ticket: Ticket, result: Result, horizon: float) -> tuple["Trial", Verdict]:
+        """Hear how it ended. A success without a distance that can be is no result of eta.
+
+        Args:
+          ticket: of who tells.
+          result: that is told.
+          horizon: longest walk of the study, s.
+        """
         verdict = self._judge(ticket)
         if verdict is not Verdict.COUNTED:
             return self, verdict
         far = math.inf if result.distance is None else abs(result.distance)
-        if result.state is S.SUCCEEDED and not far <= FARTHEST:
+        if result.state is S.SUCCEEDED and not far <= farthest(horizon):
             why = f"no distance that can be was measured: {result.distance}"
             result = replace(result, state=S.ABORTED, reason=why)
         return replace(self, state=result.state, result=result), Verdict.COUNTED
@@ -294,6 +298,15 @@ class Trial:
         if self.state is not S.REQUESTED:
             raise TrialError(f"trial {self.id} is {self.state}; ask its agent to cancel it")
         return replace(self, state=S.ABORTED, result=Result(S.ABORTED, reason=reason))
+
+    def void(self, reason: str) -> "Trial":
+        """Let a walk not count after all: its distance was mistyped, or somebody held the robot."""
+        if self.state is S.ABORTED and self.result and self.result.reason == reason:
+            return self
+        if self.state not in TOLD or self.result is None:
+            raise TrialError(f"trial {self.id} is {self.state}; there is nothing to make void")
+        result = replace(self.result, state=S.ABORTED, reason=reason)
+        return replace(self, state=S.ABORTED, result=result)
 
     def retry(self, attempt: int) -> "Trial":
         """Run it again, which only an operator may want; the same decision twice is one.
@@ -380,6 +393,11 @@ class Study:
     def searched(self) -> tuple[Trial, ...]:
         """Those of them that the search consists of."""
         return tuple(t for t in self.told if t.purpose in (Purpose.INITIAL, Purpose.SEARCH))
+
+    def infeasible(self) -> int:
+        """Trials at the end of which none walked, because of their etas or without a result."""
+        walked = (n for n, t in enumerate(reversed(self.trials)) if t.state is S.SUCCEEDED)
+        return next(walked, len(self.trials))
 
     def failures(self) -> int:
         """Trials at the end that gave no result."""

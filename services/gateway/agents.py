@@ -58,7 +58,7 @@ class AgentView:
         """How it is."""
         self.state, self.health = heartbeat.state, heartbeat.health
         self.trial = heartbeat.trial
-        if self.state in STILL:
+        if self.state in STILL and self.health.get("limp") is True:
             self.stop = None
 
     def changed(self) -> bool:

@@ -295,6 +295,24 @@ async def cancel_trial(
     return _trial(await conductor_of(request).cancel(study, number, user.name), number)
 
 
+@v1.post(
+    "/studies/{study:name}/trials/{number:int}:void", response_model=TrialShape, responses=WRITE
+)
+async def void_trial(
+    request: Request,
+    user: Operator,
+    study: StudyName,
+    number: Number,
+    why: Reason,
+    key: IdempotencyKey = None,
+) -> Response:
+    """Let a walk not count after all, before an eta is chosen by it; the study pauses."""
+    reason = f"made void by {user.name}: {why.reason}"
+    order = partial(orders.void, number=number, reason=reason)
+    told = await conductor_of(request).change(study, user.name, order, "voided")
+    return _trial(told, number)
+
+
 def _trial(study: Study, number: int) -> Response:
     return as_json(trial_document(study.trial(number)))
 

@@ -18,6 +18,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, Protocol
 
+from pup.errors import InputError
 from pup.transfer import orders
 from pup.transfer.steps import Choose, Finish, Step, Suggest, Wait, Walk, next_step
 from pup.transfer.study import (
@@ -183,7 +184,7 @@ class Conductor:
     async def stop(self, agent: str, who: str, reason: str) -> None:
         """Stop a robot, now; then pause what it was at, or would be next.
 
-        It is told again until it says that it has stopped.
+        It is told again until it says that it is limp.
 
         Raises:
           TrialError: it has not said so.
@@ -205,7 +206,7 @@ class Conductor:
             await asyncio.sleep(0.05)
         if view.stop:
             raise TrialError(
-                f"{agent} has not said that it stopped: use the switch at the robot; it is told "
+                f"{agent} has not said that it is limp: use the switch at the robot; it is told "
                 "again, and its studies are paused"
             )
 
@@ -252,7 +253,9 @@ class Conductor:
         async with self._locks[name]:
             study = self.studies[name]
             before = study.trial(number)
-            trial, verdict = before.finish(Ticket(body.attempt, body.fence, agent), result)
+            trial, verdict = before.finish(
+                Ticket(body.attempt, body.fence, agent), result, study.settings.horizon
+            )
             if verdict is Verdict.COUNTED:
                 event = Event(trial.state.value, agent, number, asdict(body))
                 study = orders.after_end(study.with_trial(trial), trial)
@@ -400,7 +403,11 @@ class Conductor:
             case Walk(eta, purpose):
                 await self._add(study, eta, purpose, {"eta": list(eta), "purpose": purpose.value})
             case Choose():
-                decision = await self.fits.run(fits.choose, study, self.simulated[study.name])
+                try:
+                    decision = await self.fits.run(fits.choose, study, self.simulated[study.name])
+                except InputError as error:  # nothing walked: another attempt finds the same
+                    await self._write(Change(orders.pause(study, str(error)), events=[]))
+                    return
                 await self._keep(study, decision)
             case Finish():
                 study = replace(study, state=StudyState.DONE)
