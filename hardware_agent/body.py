@@ -19,6 +19,7 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 
 TILT = 1.0  # rad, of a robot without a gait
+SILENT = 1.0  # s, after which an IMU is set up anew while the robot is limp
 DOUBT = 2.0  # s, from which on a servo that does not say that it is limp is a problem
 
 
@@ -59,7 +60,7 @@ class Body:
         }
         self._seen = np.full(n, -math.inf)
         self._imu: Orientation | None = None
-        self._imu_seen = -math.inf
+        self._imu_seen = self._mended = -math.inf
         self._written = -math.inf
         self.goal = np.full(n, math.nan)
         self._doubted = set(range(n))
@@ -236,6 +237,20 @@ class Body:
             self.bus.torque(False)
         elif holds is not None:
             self._doubted.discard(there[0])
+
+    def mend(self, senses: Senses) -> None:
+        """Set an IMU up anew that is silent: its supply may have broken down and reset it.
+
+        Only while the robot is known to be limp: it takes longer than a tick.
+
+        Raises:
+          BusError: its port is gone.
+        """
+        if self.imu is None or self.doubted:
+            return
+        if senses.time - max(senses.imu_seen, self._mended) > SILENT:
+            self._mended = senses.time
+            self.imu.configure()
 
     def limp(self) -> bool:
         """Torque off; False when the bus does not take it."""

@@ -211,12 +211,25 @@ class Bno055:
                 time.sleep(0.1)
             else:
                 raise BusError(f"{place}: no BNO055 answers")
-            for register, value in ((MODE, CONFIG_MODE), (UNITS, 0), (MODE, IMU_MODE)):
-                if not any(self._wire.write(register, value) for _ in range(TRIES)):
-                    raise BusError(f"{place}: cannot be configured")
-                time.sleep(SWITCH)
         except FAILURES as error:
             raise BusError(f"{place}: {device_error(error)}") from error
+        if not self.configure():
+            raise BusError(f"{place}: cannot be configured")
+
+    def configure(self) -> bool:
+        """Start its fusion; False where it does not take that.
+
+        Raises:
+          BusError: the port is gone.
+        """
+        try:
+            for register, value in ((MODE, CONFIG_MODE), (UNITS, 0), (MODE, IMU_MODE)):
+                if not any(self._wire.write(register, value) for _ in range(TRIES)):
+                    return False
+                time.sleep(SWITCH)
+        except FAILURES as error:
+            raise BusError(f"{self._settings.port}: {device_error(error)}") from error
+        return True
 
     def close(self) -> None:
         """Give the port up."""
@@ -269,6 +282,10 @@ class Board:
     def open(self) -> None:
         """Forget what was."""
         self._time = math.nan
+
+    def configure(self) -> bool:
+        """Nothing: the board has no modes."""
+        return True
 
     def ask(self) -> None:
         """Nothing: it is asked with the servos."""

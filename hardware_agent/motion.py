@@ -174,6 +174,7 @@ class Motion(threading.Thread):
             else:
                 self._body.guard.rest(senses)
                 self._body.confirm_limp(senses)
+                self._body.mend(senses)
             self._serve(senses)
         except BusError as error:
             self._bus = False

@@ -9,7 +9,7 @@ from agents import DARWIN, bundle, standing
 
 from hardware_agent.activities import WATCHED, Activity, Event, Hold, Settle, Walk
 from hardware_agent.config import ControlSettings, ImuSettings
-from hardware_agent.imu import Bno055, Orientation
+from hardware_agent.imu import IMU_MODE, MODE, Bno055, Orientation
 from hardware_agent.policies import Shelf
 from hardware_agent.recordings import Recordings
 from hardware_agent.rollout import Rollout, row_names
@@ -70,19 +70,23 @@ def test_an_imu_that_was_reset_tells_nothing() -> None:
     """All its registers are zero then, as if the robot stood upright and quiet."""
 
     class Registers:
-        def __init__(self, data: bytes) -> None:
-            self.data = data
+        mode = 0
+
+        def write(self, register: int, value: int) -> bool:
+            self.mode = value if register == MODE else self.mode
+            return True
 
         def ask(self, register: int, length: int) -> None:
             pass
 
         def take(self, length: int) -> bytes:
-            return self.data
+            gravity = bytes(4) + (981).to_bytes(2, "little") + bytes(18)
+            return gravity if self.mode == IMU_MODE else bytes(24)
 
-    settings = ImuSettings()
-    gravity = bytes(4) + (981).to_bytes(2, "little") + bytes(18)
-    assert Bno055(settings, Registers(bytes(24))).take(None, 0.0) is None
-    told = Bno055(settings, Registers(gravity)).take(None, 0.0)
+    imu = Bno055(ImuSettings(), Registers())
+    assert imu.take(None, 0.0) is None
+    assert imu.configure()
+    told = imu.take(None, 0.0)
     assert told is not None and np.linalg.norm(told.accel) == pytest.approx(9.81)
 
 
