@@ -60,7 +60,7 @@ class Body:
         }
         self._seen = np.full(n, -math.inf)
         self._imu: Orientation | None = None
-        self._imu_seen = self._mended = -math.inf
+        self._imu_seen = self._mended = self._sensed = -math.inf
         self._written = -math.inf
         self.goal = np.full(n, math.nan)
         self._doubted = set(range(n))
@@ -138,7 +138,7 @@ class Body:
             status = answers.servos.get(number)
             if status is None:
                 continue
-            if not self.torque and now - self._seen[j] > self.settings.safety.stale:
+            if not self.torque and self._seen[j] < self._sensed:
                 self._doubted.add(j)  # it was away, and did not hear that it shall be limp
             self._seen[j] = now
             for kind, values in self._known.items():
@@ -147,6 +147,7 @@ class Body:
                     values[j] = told
             if status.alarm:
                 alarms[self.names[j]] = self.bus.alarm(number) or status.alarm
+        self._sensed = now
         return alarms
 
     def enable(self, senses: Senses) -> Trip | None:

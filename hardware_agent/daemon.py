@@ -276,7 +276,7 @@ class Agent:
             return self._order(call.command)
         if refused is not None:
             raise InputError(refused.reason)
-        return {"state": str(self._motion.status.state)}
+        return {"state": str(self._motion.state)}
 
     def _order(self, command: dict[str, Any]) -> None:
         """What the operator tells of a trial."""

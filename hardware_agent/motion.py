@@ -118,6 +118,11 @@ class Motion(threading.Thread):
         """
         self._ask(lambda senses: self._placed(assign, cold))
 
+    @property
+    def state(self) -> AgentState:
+        """Of the robot, as of now; `status` is as of the last tick's end."""
+        return self._state
+
     def cancel(self, reason: str) -> None:
         """End the trial that there is, standing."""
         self._ask(lambda senses: self._cancel(reason))

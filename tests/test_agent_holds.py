@@ -131,6 +131,14 @@ def test_servos_whose_cable_was_out_are_made_limp_when_it_is_back(tmp_path: Path
         assert made.say("stop")["limp"] is made.health()["limp"] is True
 
 
+def test_a_robot_is_known_to_be_limp_within_a_second(tmp_path: Path) -> None:
+    """By the clock on the wall, with the usual limits: servos are asked one a tick."""
+    with lab(tmp_path, speed=1.0, more="[safety]\nstale = 0.02\n") as made:
+        made.start()
+        assert made.say("enable")["state"] == "enabled"
+        assert made.say("stop")["limp"] and holding(made) == 0
+
+
 def test_whoever_enables_a_robot_that_walks_is_refused_and_it_walks_on(tmp_path: Path) -> None:
     policy = bundle(tmp_path / "policies" / "still", standing())
     with at_work(tmp_path, speed=1.0) as (made, gateway):
