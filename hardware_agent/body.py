@@ -63,7 +63,11 @@ class Body:
         self._imu_seen = self._mended = self._sensed = -math.inf
         self._written = -math.inf
         self.goal = np.full(n, math.nan)
-        self._doubted = set(range(n))
+        self._doubt()
+
+    def _doubt(self) -> None:
+        """Any servo may hold."""
+        self._doubted = set(range(len(self.names)))
         self._limp_since = time.monotonic()
 
     def open(self) -> list[str]:
@@ -162,11 +166,12 @@ class Body:
             silent = ", ".join(self.names[j] for j in np.flatnonzero(stale)[:3]) or "the IMU"
             return Trip("enable", f"the pose is not known: {silent} does not answer")
         self.guard.reset()
+        self._doubt()  # from here on, whatever comes of it; some come on by a goal alone
         self.goal, self._written = senses.position.copy(), senses.time
         self.bus.prepare(self.goal, self.settings.safety.late)
         deaf = self.bus.without(self.goal)
         if deaf:
-            self.limp()  # some servos come on by a goal alone
+            self.limp()
             told = ", ".join(self.names[self.ids.index(number)] for number in deaf[:3])
             return Trip("enable", f"{told} did not take its goal")
         self.bus.torque(True)
@@ -254,10 +259,13 @@ class Body:
             self.imu.configure()
 
     def limp(self) -> bool:
-        """Torque off; False when the bus does not take it."""
+        """Torque off; False when the bus does not take it.
+
+        Told again, it doubts no servo that has said so since: a stop may be sent twice a second.
+        """
+        if self.torque:
+            self._doubt()
         self.torque = False
-        self._doubted = set(range(len(self.names)))
-        self._limp_since = time.monotonic()
         try:
             self.bus.torque(False)
         except BusError:
