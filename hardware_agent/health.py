@@ -17,6 +17,7 @@ from pup.wire import AgentState
 
 SILENT = 1.0  # s without a tick after which the loop counts as hung
 LATE = 1.5  # times the period that the 99th percentile may take
+FEWEST = 200  # ticks, of fewer of which it is nearly the longest
 
 
 def health(
@@ -85,7 +86,8 @@ def _problems(
         more = f" and {len(status.doubted) - 3} more" if len(status.doubted) > 3 else ""
         problems.append(f"{told}{more}: not known to be limp")
     limit = LATE / settings.control.rate
-    if settings.control.clock == "wall" and status.timing.p99 > limit:
+    timed = settings.control.clock == "wall" and status.timing.ticks >= FEWEST
+    if timed and status.timing.p99 > limit:
         problems.append(f"the control loop is late: p99 of its period {status.timing.p99:.4f} s")
     if not watchdog:
         problems.append("the watchdog process has ended")

@@ -92,6 +92,10 @@ class Metronome:
         longest = float(periods.max()) if len(periods) else math.nan
         return Timing(self._ticks, self._missed, float(p50), float(p99), longest)
 
+    def leave_out(self) -> None:
+        """Leave the tick under way out of the statistics: it does what takes longer than one."""
+        self._last = math.nan
+
     def forget(self) -> None:
         """Begin the statistics anew."""
         self._periods.clear()

@@ -307,6 +307,7 @@ class Motion(threading.Thread):
             return Refused("a trial is under way")
         if self._activity is None:
             self._beat(torque=True)  # the watchdog watches from before it is on
+            self.metronome.leave_out()
             trip = self._body.enable(senses)
             if trip is not None:
                 return Refused(str(trip))
