@@ -2,7 +2,6 @@
 
 import json
 import os
-import pty
 import signal
 import subprocess
 import sys
@@ -20,8 +19,6 @@ from hardware_agent.bus import Bus
 from hardware_agent.config import BusSettings
 from hardware_agent.policies import digest_of
 from hardware_agent.port import BusyError
-from hardware_agent.prompt import MOVING
-from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import Harmonics
 from pup.wire import (
@@ -343,86 +340,3 @@ def test_whoever_presses_it_the_robot_stops(tmp_path: Path) -> None:
 
 def _command(pid: int) -> str:
     return Path(f"/proc/{pid}/cmdline").read_text()
-
-
-@pytest.mark.slow
-def test_the_operator_lets_trials_start_and_tells_distances(tmp_path: Path) -> None:
-    policy = bundle(tmp_path / "policies" / "still")
-    by_hand = '[control]\ngate = "operator"\n[distance]\nkind = "operator"\n'
-    with at_work(tmp_path, more=by_hand) as (made, gateway):
-        gateway.send(assign(policy, "a"))
-        wait(lambda: made.health()["waiting"] == "arm", 20, made.log)
-        assert not gateway.of(Armed)
-        made.say("arm")
-        wait(lambda: made.health()["waiting"] == "distance", 20, made.log)
-        for wrong in ({"distance": 62.0}, {"distance": 0.6, "trial": "b"}):  # cm; another's
-            with pytest.raises(InputError, match=r"cannot be|is asked for"):
-                made.say("distance", **wrong)
-        made.say("distance", distance=0.62)
-        wait(lambda: bool(gateway.of(Finished)), 20, made.log)
-        (ended,) = {f.distance for f in gateway.of(Finished)}
-        assert ended == 0.62
-        gateway.send(assign(policy, "b"))
-        wait(lambda: made.health()["waiting"] == "arm", 20, made.log)
-        made.say("skip")
-        wait(lambda: gateway.of(Finished)[-1].trial == "b", 20, made.log)
-        assert gateway.of(Finished)[-1].state is Outcome.ABORTED
-
-
-@pytest.mark.slow
-def test_at_the_prompt_a_key_enables_and_any_other_stops(tmp_path: Path) -> None:
-    with lab(tmp_path, speed=1.0) as made:
-        made.start()
-        command = [sys.executable, "-m", "hardware_agent.cli", "operate", "--config"]
-        prompt, theirs = pty.openpty()
-        operator = subprocess.Popen(
-            [*command, str(made.config)], stdin=theirs, stdout=subprocess.PIPE
-        )
-        assert operator.stdout is not None and b"STOPS" in operator.stdout.readline()
-        for key in (b" ", b"\x03", b"\x1a"):  # Ctrl-C and Ctrl-Z too
-            os.write(prompt, b"e")
-            made.until("enabled")
-            os.write(prompt, key)
-            assert made.until("stopped")["reason"] == "stop: by the operator"
-        os.write(prompt, b"q")
-        assert operator.wait(timeout=20) == 0
-        operator.stdout.close()
-        os.close(prompt)
-        os.close(theirs)
-
-
-@pytest.mark.slow
-def test_keys_stop_while_a_distance_is_typed_and_so_does_a_terminal_that_is_lost(
-    tmp_path: Path,
-) -> None:
-    policy = bundle(tmp_path / "policies" / "still", standing())
-    by_hand = '[control]\ngate = "operator"\n[distance]\nkind = "operator"\n'
-    command = [sys.executable, "-m", "hardware_agent.cli", "operate", "--config"]
-    with at_work(tmp_path, speed=1.0, more=by_hand) as (made, gateway):
-        prompt, theirs = pty.openpty()
-        operator = subprocess.Popen(
-            [*command, str(made.config)],
-            stdin=theirs,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        )
-        os.close(theirs)
-        assert operator.stdout is not None and b"STOPS" in operator.stdout.readline()
-        gateway.send(assign(policy, "a"))
-        assert any(b"ENTER starts" in line for line in operator.stdout)  # another key would stop
-        os.write(prompt, b"\r")
-        wait(lambda: made.health()["waiting"] == "distance", 40, made.log)
-        os.write(prompt, b"0.7\x7f6 ")
-        made.until("stopped")
-        os.write(prompt, b"2\r")
-        wait(lambda: bool(gateway.of(Finished)), 20, made.log)
-        assert gateway.of(Finished)[0].distance == 0.62
-        made.say("enable")
-        gateway.send(assign(policy, "b", horizon=20.0))
-        assert any(b"ENTER starts" in line for line in operator.stdout)  # another key would stop
-        os.write(prompt, b"\r")
-        wait(lambda: made.health()["stage"] in MOVING, 40, made.log)
-        os.close(prompt)
-        assert "terminal is gone" in made.until("stopped")["reason"]
-        assert operator.wait(timeout=20) == 1
-        operator.stdout.close()

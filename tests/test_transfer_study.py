@@ -229,31 +229,6 @@ def test_a_pause_makes_no_trials():
     assert isinstance(next_step(Study("s", SETTINGS, state=StudyState.PAUSED)), Wait)
 
 
-def test_failures_in_a_row_are_counted():
-    study = Study("s", SETTINGS)
-    ends = [S.SUCCEEDED, S.ABORTED, S.ABORTED]
-    for number, state in enumerate(ends, 1):
-        trial = fresh(number).release().assign("a", number)
-        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0), 15.0)
-        study = study.with_trial(trial)
-    assert study.failures() == 2
-
-
-def test_a_retried_trial_that_fails_again_pauses_its_study():
-    """Though others have succeeded since."""
-    study = Study("s", SETTINGS)
-    for number, state in enumerate([S.ABORTED, S.SUCCEEDED, S.SUCCEEDED], 1):
-        trial = fresh(number).release().assign("a", number)
-        trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0), 15.0)
-        study = study.with_trial(trial)
-    assert study.failures() == 0
-    study = orders.retry(study, 1, 2)
-    trial = study.trial(1).assign("a", 9)
-    trial, _ = trial.finish(Ticket(2, 9, "a"), Result(S.ABORTED, reason="fell asleep"), 15.0)
-    study = orders.after_end(study.with_trial(trial), trial)
-    assert study.state is StudyState.PAUSED and "trial 1 was aborted" in study.reason
-
-
 def walked(*states: S) -> Study:
     study = Study("s", SETTINGS)
     for number, state in enumerate(states, 1):
@@ -261,6 +236,21 @@ def walked(*states: S) -> Study:
         trial, _ = trial.finish(Ticket(1, number, "a"), Result(state, 1.0), 15.0)
         study = orders.after_end(study.with_trial(trial), trial)
     return study
+
+
+def test_failures_in_a_row_are_counted():
+    assert walked(S.SUCCEEDED, S.ABORTED, S.ABORTED).failures() == 2
+
+
+def test_a_retried_trial_that_fails_again_pauses_its_study():
+    """Though others have succeeded since."""
+    study = walked(S.ABORTED, S.SUCCEEDED, S.SUCCEEDED)
+    assert study.failures() == 0
+    study = orders.retry(study, 1, 2)
+    trial = study.trial(1).assign("a", 9)
+    trial, _ = trial.finish(Ticket(2, 9, "a"), Result(S.ABORTED, reason="fell asleep"), 15.0)
+    study = orders.after_end(study.with_trial(trial), trial)
+    assert study.state is StudyState.PAUSED and "trial 1 was aborted" in study.reason
 
 
 def test_a_walk_that_shall_not_count_is_void_until_an_eta_was_chosen_by_it():
