@@ -80,7 +80,7 @@ class Deadly:
             self._deed()
 
         conductor.store.write = dying
-        conductor.send = self.send
+        conductor.courier.send = self.send
 
     def send(self, agent, body):
         self._deed()
@@ -110,7 +110,7 @@ def life(database, robot, deadline):
             for _ in range(200):
                 view.beat(Heartbeat("darwin-1", AgentState.ENABLED))
                 view.heard = asyncio.get_running_loop().time()
-                conductor._sent.clear()  # as if RESEND had gone by
+                conductor.courier._sent.clear()  # as if RESEND had gone by
                 await conductor._look("s")
                 for ticket, result in list(robot.results.items()):
                     if ticket not in acknowledged:  # the agent resends
@@ -279,7 +279,7 @@ def test_a_silent_agent_loses_the_trial_and_its_late_result_never_counts(tmp_pat
         store = Store(f"sqlite:///{tmp_path / 'late.db'}")
         conductor = Conductor(store, InProcess(), Metrics())
         sent = []
-        conductor.send = lambda agent, body: sent.append(body)
+        conductor.courier.send = lambda agent, body: sent.append(body)
         view = conductor.agents["darwin-1"] = AgentView("darwin-1")
         view.greet(Hello("darwin-1", "darwin_op2", "1", (Policy("walk", POLICY),)))
         view.beat(Heartbeat("darwin-1", AgentState.ENABLED))

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from pup.errors import InputError
 from pup.transfer import orders
@@ -35,10 +35,11 @@ from pup.transfer.study import (
     TrialState,
     Verdict,
 )
-from pup.wire import Accepted, Armed, Body, Cancel, Finished, Running, Stop
+from pup.wire import Accepted, Armed, Cancel, Finished, Running, Stop
 from services.gateway import fits
 from services.gateway.agents import AgentView
-from services.gateway.assignment import assignment, place_of, unfit, waits_for
+from services.gateway.assignment import place_of, unfit, waits_for
+from services.gateway.courier import Courier
 from services.gateway.metrics import Metrics
 from services.gateway.posteriors import Posteriors
 from services.gateway.records import Row
@@ -50,9 +51,6 @@ PERIOD = 0.5
 """Between two looks at leases, idle agents and unanswered assignments, s."""
 CONFIRMED = 2.0
 """In which a robot must say that it has stopped, s."""
-RESEND = 2.0
-"""Without an answer to an assignment until it is sent again, s."""
-
 
 REPORTED = {
     Accepted: TrialState.ASSIGNED,
@@ -63,14 +61,6 @@ REPORTED = {
 
 class UnknownError(TrialError):
     """There is no such study or agent."""
-
-
-class Send(Protocol):
-    """Sends a message to an agent, if it is connected."""
-
-    def __call__(self, agent: str, body: Body) -> None:
-        """Send it; nothing happens where it is away."""
-        ...
 
 
 class Conductor:
@@ -89,11 +79,10 @@ class Conductor:
         self.simulated: dict[str, Row | None] = {}
         self.agents: dict[str, AgentView] = {}
         self.revision: dict[str, int] = defaultdict(int)
-        self.send: Send = lambda agent, body: None
+        self.courier = Courier(self.agents)
         self.stopped: BaseException | None = None
         self._locks: dict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._heard: dict[str, float] = {}
-        self._sent: dict[str, float] = {}
         self._changed: dict[str, asyncio.Event] = defaultdict(asyncio.Event)
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._trouble: dict[str, str] = {}
@@ -116,7 +105,7 @@ class Conductor:
         """Look once at all agents and studies."""
         for view in self.agents.values():
             if view.stop:
-                self.send(view.name, view.stop)
+                self.courier.send(view.name, view.stop)
             if view.changed():
                 self.notify("")
                 for study in self.studies.values():
@@ -178,7 +167,7 @@ class Conductor:
         reason = reason or f"cancelled by {who}"
         order = partial(orders.cancel, number=number, reason=reason)
         study = await self.change(name, who, order, "cancelled")
-        self._recall(study.trial(number))
+        self.courier.recall(study.trial(number))
         return study
 
     async def stop(self, agent: str, who: str, reason: str) -> None:
@@ -193,13 +182,13 @@ class Conductor:
             raise UnknownError(f"there is no agent {agent}")
         view = self.agents[agent]
         view.stop = Stop(f"{who}: {reason}")
-        self.send(agent, view.stop)
+        self.courier.send(agent, view.stop)
         told = f"{agent} was stopped by {who}: {reason}"
         for name in list(self.studies):
             order = partial(orders.halt, agent=agent, reason=told)
             study = await self.change(name, who, order, "stopped")
             if study.open:
-                self._recall(study.open)
+                self.courier.recall(study.open)
         await self.store.log([Event("stopped", who, detail={"agent": agent, "reason": reason})])
         end = time.monotonic() + CONFIRMED
         while view.stop and view.present and time.monotonic() < end:
@@ -231,7 +220,7 @@ class Conductor:
                 event = Event(trial.state.value, agent, number, asdict(body))
                 await self._write(Change(study.with_trial(trial), [trial], [event]))
         if verdict in (Verdict.LATE, Verdict.UNKNOWN) and not isinstance(body, Running):
-            self.send(agent, Cancel(body.trial, body.attempt, body.fence))
+            self.courier.send(agent, Cancel(body.trial, body.attempt, body.fence))
         return verdict
 
     async def finished(self, agent: str, body: Finished) -> Verdict:
@@ -351,25 +340,18 @@ class Conductor:
                 self._wanted.add(name)
 
     async def _watch(self, study: Study, trial: Trial) -> None:
-        now = time.monotonic()
-        if now - self._heard[study.name] > study.settings.lease:
+        if time.monotonic() - self._heard[study.name] > study.settings.lease:
             lost = trial.expire()
             event = Event("lost", trial=trial.number, detail={"agent": trial.agent})
             study = orders.after_end(study.with_trial(lost), lost)
             await self._write(Change(study, [lost], [event]))
             self.metrics.trials.labels("lost").inc()
-        elif now - self._sent.get(trial.wire, 0.0) <= RESEND:
+        elif self.courier.waits(trial):
             return
         elif trial.cancelled:
-            self._recall(trial)
+            self.courier.recall(trial)
         elif trial.state is TrialState.ASSIGNED:
-            self._assign(study, trial)
-
-    def _recall(self, trial: Trial) -> None:
-        """Ask its agent to end a trial that is cancelled; until it has."""
-        if trial.cancelled and trial.state in HANDED_OUT and trial.agent:
-            self._sent[trial.wire] = time.monotonic()
-            self.send(trial.agent, Cancel(trial.wire, trial.attempt, trial.fence))
+            self.courier.assign(study, trial)
 
     async def _hand_out(self, study: Study, trial: Trial) -> None:
         reasons = unfit(study, self.studies, self.agents)
@@ -381,15 +363,7 @@ class Conductor:
         self._heard[study.name] = time.monotonic()
         event = Event("assigned", trial=given.number, detail={"agent": agent, "fence": given.fence})
         await self._write(Change(study, [given], [event]))
-        self._assign(study, given)
-
-    def _assign(self, study: Study, trial: Trial) -> None:
-        """Tell an agent to run a trial, unless its journal says that it knows."""
-        view = self.agents.get(trial.agent or "")
-        if view is None or (trial.wire, trial.attempt, trial.fence) in view.journal:
-            return
-        self._sent[trial.wire] = time.monotonic()
-        self.send(view.name, assignment(study, trial))
+        self.courier.assign(study, given)
 
     async def _step(self, study: Study, step: Step) -> None:
         match step:

@@ -97,7 +97,7 @@ class Link:
         except zmq.ZMQError as error:
             raise InputError(f"link: {self.config.link} cannot be bound ({error})") from error
         self.bound = True
-        self.conductor.send = self.send
+        self.conductor.courier.send = self.send
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Whether a key, in z85, is let in; called by the authenticator."""
