@@ -1,5 +1,7 @@
 """What fitted models amount to: twins of a finding, and what a model leaves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,7 +61,31 @@ def test_a_model_of_some_recordings_leaves_what_it_leaves_of_those() -> None:
     assert left_over(left(some, 1.0), noise) == 0
     beyond = left_over(left(some, 2.0), noise)
     assert beyond == pytest.approx(2.9 * len(some.values), rel=0.1)
-    assert probabilities([left(some, 2.0), left(some, 2.0, 1.0)], noise).sum() == pytest.approx(1)
+
+
+def rival(effect: str, error: float, held_out: float = 0.0) -> Model:
+    model = left(MEASURED, error, held_out)
+    return replace(model, hypotheses=(score(effect, 1.0, 1.0).trace.hypothesis,))
+
+
+def test_a_sibling_that_explains_nearly_as_much_keeps_a_part_of_what_its_class_is_given() -> None:
+    """Real gears act in forms of their own: which of two is nearer is less sure than the class."""
+    noise, before = Noise(np.full(3, 0.002), np.zeros(3), "repeats"), left(MEASURED, 20.0)
+    gear = rival("gear_efficiency", 1.0)
+    near, far = rival("load_dependent_friction", 1.5), rival("load_dependent_friction", 10.0)
+    lag = rival("actuator_lag", 1.5)  # as near, but of another class
+    told = probabilities([gear, near, lag], before, noise)
+    assert told.sum() == pytest.approx(1)
+    assert told[0] > 0.85
+    assert told[1] > 0.05
+    assert told[2] < 1e-6
+    assert probabilities([gear, far], before, noise)[1] < 0.01
+
+
+def test_siblings_that_fit_alike_are_alike_likely() -> None:
+    noise, before = Noise(np.full(3, 0.002), np.zeros(3), "repeats"), left(MEASURED, 20.0)
+    late, old = rival("command_delay", 1.0), rival("measurement_delay", 1.0)
+    assert probabilities([late, old], before, noise) == pytest.approx([0.5, 0.5])
 
 
 def test_noise_that_is_not_well_known_is_no_reason_to_doubt() -> None:

@@ -200,7 +200,7 @@ def rivals(chosen: Round, diagnosis: Diagnosis) -> list[Rival]:
     told = {score.trace.hypothesis: score for score in chosen.ranking}
     likely = chosen.finalists[: chosen.holding or None]
     chances = np.zeros(len(chosen.finalists))
-    chances[: len(likely)] = probabilities(likely, diagnosis.noise)
+    chances[: len(likely)] = probabilities(likely, chosen.before, diagnosis.noise)
     return [
         Rival(
             told[model.hypotheses[-1]],

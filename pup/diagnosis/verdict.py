@@ -17,6 +17,7 @@ from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector
+from pup.diagnosis.shortlist import EVERYWHERE
 from pup.physics.terms import TERMS, Place, split_column
 
 Array = NDArray[np.float64]
@@ -28,6 +29,9 @@ UNKNOWN = 0.03
 """Probability that a cause outside the library looks like the best inside, and fits as well."""
 BLUR = 0.5
 """Difference of worth, in what is left, at which rivals count as equals but for a factor of e."""
+OWN_FORM, FORM = 0.2, 0.03
+"""Probability that what is there acts in no form of the library, but near those of a class; and
+the share of what the best of them explains that another one may leave and be as near."""
 DOUBT = 0.2
 """Where this share of what is to be explained is left, a name is as likely wrong as right."""
 SURE = 1.645
@@ -110,20 +114,35 @@ class HeldOut:
     per_motion: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def probabilities(models: Sequence[Model], noise: Noise) -> Array:
+def probabilities(models: Sequence[Model], before: Model, noise: Noise) -> Array:
     """Of some rival models by their worth, if the cause is known to the library.
 
     Where the best leaves more than noise, other effects are still hidden or forms are not quite
-    right, and rivals that leave as much more are as good.
+    right, and rivals that leave as much more are as good. What acts in a form of its own may look
+    more like another effect of its class, so that siblings that explain nearly as much share a part
+    of what their class is given.
 
     Args:
       models: the rivals, the best first.
+      before: the model that each adds one effect to.
       noise: that the samples are weighed by.
     """
     worth = np.array([m.worth for m in models])
-    blur = BLUR * left_over(models[0], noise)
-    weights = np.exp(-(worth - worth.min()) / (2 * TEMPERATURE + blur))
+    worth -= worth.min()
+    weights = np.exp(-worth / (2 * TEMPERATURE + BLUR * left_over(models[0], noise)))
+    best = models[0].hypotheses[-1]
+    siblings = np.array([_sibling(m.hypotheses[-1], best) for m in models])
+    explained = max(before.fit.chi2 - models[0].fit.chi2, 0.0)
+    alike = siblings * np.exp(-worth / (2 * TEMPERATURE + FORM * explained))
+    shared = OWN_FORM * weights[siblings].sum() * alike / alike.sum()
+    weights = np.where(siblings, (1 - OWN_FORM) * weights, weights) + shared
     return np.asarray(weights / weights.sum())
+
+
+def _sibling(one: Hypothesis, other: Hypothesis) -> bool:
+    """Whether two hypotheses are forms of one class at one place."""
+    everywhere = one.place.kind in EVERYWHERE and other.place.kind in EVERYWHERE
+    return one.family == other.family and (one.place == other.place or everywhere)
 
 
 def left_over(model: Model, noise: Noise) -> float:
@@ -261,7 +280,7 @@ def _rivals(
 ) -> tuple[float, tuple[Alternative, ...]]:
     """The probability of a finding and of what else it might be, `known` in all."""
     models = chosen.finalists[: chosen.holding]
-    chances = known * probabilities(models, selector.noise)
+    chances = known * probabilities(models, chosen.before, selector.noise)
     by_key: dict[tuple[str, Place], float] = {}
     for model, chance in zip(models, chances, strict=True):
         key = model.hypotheses[-1].key
