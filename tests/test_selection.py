@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from pup.diagnosis import selection
+from pup.diagnosis import exchanges, selection
 from pup.diagnosis.evidence import Projector, Trace
+from pup.diagnosis.exchanges import Exchanger
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import LOST
-from pup.diagnosis.selection import Selector
 from pup.diagnosis.starts import Tried
 from pup.robot import RobotDescription
 from tests.diagnoses import ENOUGH, Maker
@@ -38,7 +38,7 @@ def made(known: Sequence[Hypothesis], worth: float) -> Model:
     return replace(model, hypotheses=tuple(known), freedom=0, fit=fit, held_out=np.array([worth]))
 
 
-class Made(Selector):
+class Made(Exchanger):
     """A selector that simulates nothing: what each set of effects is worth is given."""
 
     def __init__(self, worths: Worths, unfit: Sequence[Hypothesis] = ()) -> None:
@@ -64,8 +64,9 @@ class Made(Selector):
 
 @pytest.fixture(autouse=True)
 def still(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("fit_together", "closely"):
-        monkeypatch.setattr(selection, name, nothing)
+    for room in (exchanges, selection):
+        for name in ("fit_together", "closely"):
+            monkeypatch.setattr(room, name, nothing)
 
 
 def chosen(before: Model, *finalists: Model) -> Round:

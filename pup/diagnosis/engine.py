@@ -162,9 +162,10 @@ def diagnose(
         nominal, done = _weighed(nominal, done, replays, rng, progress, effects)
     if done is None:
         return told("undetermined", "the motions would not show any effect of the library")
-    rounds, selector = done.rounds, done.selector
+    selector = done.selector
+    settled, rounds = selector.settled(done.model, done.rounds)
     progress("what is left", 0.8)
-    model = selector.predicting(done.model)
+    model = selector.predicting(settled)
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
     shown = held_out(measured, selector.nominal, final, seed)
@@ -177,7 +178,7 @@ def diagnose(
     evidence: dict[str, Any] = {
         "found": done.found,
         "enough": done.enough,
-        "rounds": rounds,
+        "rounds": tuple(rounds),
         "held_out": shown,
         "before": selector.nominal,
         "model": final,

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
+from pup.diagnosis.exchanges import RIVALS
 from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import RIVALS, Selector, unimitated
+from pup.diagnosis.selection import Selector, unimitated
 
 Array = NDArray[np.float64]
 

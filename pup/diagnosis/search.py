@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Trace, threshold, traced
+from pup.diagnosis.exchanges import Exchanger
 from pup.diagnosis.fitting import Fit, complete, fit_together
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
@@ -20,7 +21,7 @@ from pup.diagnosis.nominal import Nominal
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
-from pup.diagnosis.selection import Selector, full
+from pup.diagnosis.selection import full
 from pup.diagnosis.starts import closely
 from pup.diagnosis.tracing import traces
 from pup.physics.terms.scale import Scale
@@ -50,7 +51,7 @@ class Search:
       enough: surprise that chance does not reach.
     """
 
-    selector: Selector
+    selector: Exchanger
     model: Model
     rounds: tuple[Round, ...]
     found: tuple[Trace, ...]
@@ -86,7 +87,7 @@ def search(
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
     told = _teller(progress)
-    selector = Selector(replays, nominal.noise, found, enough, nominal.fit, base, most, told)
+    selector = Exchanger(replays, nominal.noise, found, enough, nominal.fit, base, most, told)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
     start = selector.nominal
@@ -131,7 +132,7 @@ def search_on(
     latest = [*turned.traces(others, fit), *(t for t in found if t.hypothesis.key in own)]
     around = fit if near else base
     told = _teller(progress)
-    selector = Selector(replays, nominal.noise, latest, enough, nominal.fit, around, most, told)
+    selector = Exchanger(replays, nominal.noise, latest, enough, nominal.fit, around, most, told)
     start = selector.model(known, fit) if known else selector.nominal
     models = {done.selector.nominal: selector.nominal, done.model: start}
     rounds = turned.rounds(done.rounds, models, selector)
@@ -140,7 +141,7 @@ def search_on(
 
 
 def _searched(
-    selector: Selector,
+    selector: Exchanger,
     start: Model,
     found: Sequence[Trace],
     base: Fit,

@@ -16,7 +16,7 @@ from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
-from pup.diagnosis.models import Model, Round, chosen_in
+from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.shortlist import shortlist
@@ -25,7 +25,6 @@ from pup.diagnosis.starts import (
     closely,
     described,
     distinct,
-    joined,
     less,
     options,
     puzzling,
@@ -49,8 +48,6 @@ LEADING, MOST = 80, 400
 most like its errors before, and so many more where that was no guide."""
 ALIKE = 0.8
 """Least cosine of what a hypothesis leaves before and after, for the ranking to be a guide."""
-SWAPS, RIVALS = 2, 2
-"""Effects that may be exchanged, and rivals that each may be exchanged for."""
 PLACES = 16
 """Places that all effects together may act at."""
 KEPT = 0.25
@@ -94,25 +91,7 @@ class Selector:
         self._lesser: tuple[Model | None, list[Fit]] = None, []
         self.nominal = self.predicting(self.model((), nominal))
 
-    def run(self, start: Model, known: Sequence[Round] = ()) -> tuple[Model, list[Round]]:
-        """The model that is left when nothing more is worth adding, and how it came about.
-
-        Args:
-          start: the nominal model, or one with effects that are known already.
-          known: rounds that led to it, with models of the same samples and noise.
-        """
-        model = start
-        rounds = list(known)
-        for left in reversed(range(SWAPS + 1)):
-            model = self._added(model, rounds)
-            swap = self._swap(model, rounds) if left else None
-            if swap is None:
-                break
-            rounds.append(swap)
-            model = swap.finalists[0]
-        return self._without(model), rounds
-
-    def _added(self, model: Model, rounds: list[Round]) -> Model:
+    def added(self, model: Model, rounds: list[Round]) -> Model:
         """The model with effects added as long as one holds; notes the rounds."""
         while not full(model, self.most):
             chosen = self._round(model)
@@ -125,70 +104,7 @@ class Selector:
             self.told(model)
         return model
 
-    def _swap(self, model: Model, rounds: Sequence[Round]) -> Round | None:
-        """An effect exchanged for a rival of its own round, where what came later prefers that.
-
-        The first effects are chosen while others still hide. The last knows all of them; it was
-        chosen by worth alone, and is given up for what noise told anew makes worth more.
-        """
-        ways = self._exchanges(model, rounds)
-        if not ways:
-            return None
-        fit_together([fit for _, (_, fit) in ways], self.replays, self.noise, iterations=ROUGH)
-        last = len(model.hypotheses) - 1
-        closely([fit for n, (_, fit) in ways if n == last], self.replays, self.noise)
-        ways.sort(key=lambda way: (way[0] == last, way[1][1].chi2))
-        for number in dict.fromkeys(n for n, _ in ways):
-            rivals = [one for n, one in ways if n == number]
-            margin = self.enough if number < last else 0.0
-            if swap := self._exchanged(model, number, rivals, margin, rounds):
-                return swap
-        return None
-
-    def _exchanged(
-        self,
-        model: Model,
-        number: int,
-        rivals: Sequence[Tried],
-        margin: float,
-        rounds: Sequence[Round],
-    ) -> Round | None:
-        """One effect exchanged for the best rival that holds, where that gains a margin."""
-        if min(fit.chi2 for _, fit in rivals) > model.fit.chi2 - margin:
-            return None
-        before = self._less(model, number)
-        holds, others = self.parted(before, self.models(rivals))
-        if not holds:
-            return None
-        better = self._ended(holds[0])
-        if better.worth > model.worth - margin / 2:
-            return None
-        given_up = model.hypotheses[number]
-        known_as = replace(model, hypotheses=(*before.hypotheses, given_up))
-        holds, others = self.parted(before, [*holds[1:], *others, known_as])
-        ranking = chosen_in(rounds, given_up.key).ranking
-        return Round(before, ranking, (better, *holds, *others), 1 + len(holds))
-
-    def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
-        """Models with a rival in place of an effect, and which of them that is."""
-        known = {h.key for h in model.hypotheses}
-        last = {r.chosen.key: r for r in rounds if r.accepted}
-        ways: list[tuple[int, Tried]] = []
-        for number, hypothesis in enumerate(model.hypotheses):
-            others = tuple(h for h in model.hypotheses if h is not hypothesis)
-            if hypothesis.key not in last:  # it was known from the start
-                continue
-            chosen = last[hypothesis.key]
-            if hypothesis is model.hypotheses[-1] and chosen.settled:
-                continue
-            rivals = [m for m in chosen.finalists[1:] if m.hypotheses[-1].key not in known]
-            for rival in rivals[:RIVALS]:
-                new = rival.hypotheses[-1]
-                fit = joined(less(model.fit, hypothesis), rival.fit, new)
-                ways.append((number, ((*others, new), fit)))
-        return ways
-
-    def _ended(self, model: Model) -> Model:
+    def ended(self, model: Model) -> Model:
         """A model with its fit at its minimum, for later ones are held against it."""
         if model.fit.thorough:
             return model
@@ -199,7 +115,7 @@ class Selector:
         """A fitted model with its predictions of the folds."""
         return self.models([(tuple(hypotheses), fit)])[0]
 
-    def _less(self, model: Model, number: int) -> Model:
+    def lesser(self, model: Model, number: int) -> Model:
         """The model without one of its effects."""
         others = [h for i, h in enumerate(model.hypotheses) if i != number]
         return self.model(others, self.without(model)[number]) if others else self.nominal
@@ -232,7 +148,7 @@ class Selector:
             return Round(model, tuple(ranking), (), 0)
         holds, others = self.parted(model, self.models(better))
         if holds:
-            holds[0] = self._ended(holds[0])
+            holds[0] = self.ended(holds[0])
         return Round(model, tuple(ranking), (*holds, *others), len(holds))
 
     def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
@@ -337,7 +253,7 @@ class Selector:
             newest, *both, measured
         )
 
-    def _without(self, model: Model) -> Model:
+    def pruned(self, model: Model) -> Model:
         """The model less whatever it can do without."""
         while model.hypotheses:
             alone = len(model.hypotheses) == 1
@@ -346,7 +262,7 @@ class Selector:
             spare = int(np.argmin(costs))
             if costs[spare] > self.enough:
                 return model
-            model = self._ended(self._less(model, spare))
+            model = self.ended(self.lesser(model, spare))
         return model
 
     def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
