@@ -147,7 +147,11 @@ class Conductor:
         """The gateway takes a trial back."""
         answers, end = self._book.cancelled(cancel)
         self._send(*answers)
-        if end and self._assign is not None and _key(cancel) == _key(self._assign):
+        if not end or self._assign is None or _key(cancel) != _key(self._assign):
+            return
+        if self.stage is Stage.MEASURING:  # it walked, and shall not count all the same
+            self._finish(Outcome.ABORTED, "cancelled")
+        else:
             self._motion.cancel("cancelled")
 
     def handle(self, event: Event) -> None:

@@ -46,6 +46,7 @@ from pup.wire import (
     Heartbeat,
     Hello,
     Message,
+    Policy,
     Stop,
 )
 
@@ -99,6 +100,7 @@ class Agent:
         self._bell = threading.Event()
         self._heard: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._met = threading.Event()  # the gateway, and it has not been told hello
+        self._announced: tuple[Policy, ...] = ()
         self._link: LinkThread | None = None
         if settings.link.gateway:
             self._link = LinkThread(Link(settings.link, self._meet), self._hear)
@@ -329,6 +331,8 @@ class Agent:
             return
         if now - self._beaten >= self._settings.link.heartbeat or changed:
             self._beaten = now
+            if self._shelf.policies() != self._announced:
+                self._met.set()
             told = self.health()
             self._send(Heartbeat(self._settings.name, state, told, self._conductor.trial))
         if now - self._resent >= RESEND:
@@ -336,11 +340,12 @@ class Agent:
             self._send(*self._owed())
 
     def _hello(self) -> list[Body]:
+        self._announced = self._shelf.policies()
         hello = Hello(
             self._settings.name,
             self._robot.name,
             version("pup"),
-            self._shelf.policies(),
+            self._announced,
             self._book.entries(),
         )
         return [hello, *self._owed()]

@@ -45,7 +45,8 @@ class MotionStatus:
 
 def brief(text: str) -> str:
     """A text that fits into every message and journal: one line, not too long, sound Unicode."""
-    told = " ".join(text.encode("utf-8", "replace").decode("utf-8").split())
+    sound = text.encode("utf-8", "replace").decode("utf-8")
+    told = " ".join("".join(c if c.isprintable() else " " for c in sound).split())
     return told if len(told) <= LONGEST else f"{told[: LONGEST - 1]}…"
 
 

@@ -67,6 +67,8 @@ def _check(value: Any, depth: int = 0) -> None:
         raise WireError(f"more than {DEPTH_LIMIT} levels deep")
     if isinstance(value, Mapping | list | tuple | str) and len(value) > LENGTH_LIMIT:
         raise WireError(f"a {type(value).__name__} of {len(value)} entries; {LENGTH_LIMIT} at most")
+    if isinstance(value, str) and "\0" in value:
+        raise WireError("a text with a zero, which no database keeps")
     if isinstance(value, Mapping):
         for key, entry in value.items():
             if not isinstance(key, str) or len(key) > LENGTH_LIMIT:

@@ -137,6 +137,8 @@ def test_trials_run_on_board_are_told_and_recorded(
         fallen = gateway.run(assign(policy, "b", horizon=8.0), told=made.log)
         assert fallen.state is Outcome.SUCCEEDED and fallen.reason.startswith("fall: ")
         wait(lambda: made.health()["state"] == "enabled", 5)
+        copied = digest_of(bundle(tmp_path / "policies" / "other", parameters=("a", "b")))
+        wait(lambda: copied in [p.sha256 for p in gateway.of(Hello)[-1].policies], 20, made.log)
         unknown = gateway.run(Assign("study", "c", 1, 1, "0" * 64, (0.0,), 1.0))
         assert unknown.state is Outcome.ABORTED and "no policy" in unknown.reason
         gateway.send(assign(policy, "b", horizon=8.0))

@@ -204,6 +204,7 @@ def test_the_gateway_is_told_what_it_reads(name: str) -> None:
     assert options.action == "run"
     environment = {e["name"]: e["value"] for e in container["env"]}
     known = {PREFIX + field.upper() for field in Config.__dataclass_fields__} | {DATABASE_FILE}
+    assert environment.pop("FORWARDED_ALLOW_IPS") == "*", "uvicorn's: who may tell of TLS"
     assert set(environment) <= known
     database = environment.pop(DATABASE_FILE, None)
     assert bool(database) == (name != "dev")

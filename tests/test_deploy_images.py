@@ -93,7 +93,7 @@ def test_base_images_are_pinned() -> None:
 
 def test_what_is_installed_is_pinned_and_one_of_our_extras() -> None:
     extras = set(PROJECT["optional-dependencies"])
-    wanted = {"agent": "", "gateway": "service,postgresql", "cluster": "cluster,learn"}
+    wanted = {"agent": "", "gateway": "service,postgresql", "cluster": "service,learn,export"}
     for name, extra in wanted.items():
         base, instructions = stages()[f"build-{name}"]
         assert base == "build"

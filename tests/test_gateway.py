@@ -53,6 +53,14 @@ def test_a_viewer_changes_nothing(service, path):
     is_problem(httpx.post(service.url + path, json={}), 401)
 
 
+def test_the_body_of_a_stranger_is_not_even_read(service):
+    """Else whoever reaches the port could keep the loop of robots and stops busy with it."""
+    told = "{" + "x" * 100_000
+    is_problem(httpx.post(service.url + "/v1/studies", content=told), 401)
+    with service.client() as http:
+        is_problem(http.post("/v1/studies", content=told), 422)
+
+
 def test_probes_and_the_interface_need_no_token(service):
     assert httpx.get(f"{service.url}/healthz").text == "ok\n"
     assert httpx.get(f"{service.url}/readyz").text == "ready\n"

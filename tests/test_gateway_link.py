@@ -237,6 +237,36 @@ def test_a_recording_in_pieces_is_joined_once(service, keys, context):
     socket.close()
 
 
+def test_the_end_of_a_walk_is_owed_until_its_recording_is_kept(service, keys, context):
+    """A full disk, here a file that is in the way: the agent sends all of it again."""
+    from pup.wire import Acknowledge, RecordingChunk, decode
+
+    keys = service.agent_keys("filled")
+    socket = dealer(context, service, keys)
+    socket.connect(service.link)
+    end = Finished("s/1.ab", 1, 1, Outcome.SUCCEEDED, 0.5, 15.0, "", "walk-8", "0" * 64)
+
+    def acknowledged():
+        sent = [Message(RecordingChunk("walk-8", 0, 1, b"rows")), Message(end)]
+        for message in sent:
+            socket.send(encode(message))
+        heard, last = set(), Message(Heartbeat())
+        socket.send(encode(last))
+        while socket.poll(1000):
+            if isinstance(told := decode(socket.recv()).body, Acknowledge):
+                heard.add(told.of)
+        return [message.id in heard for message in sent]
+
+    folder = service.data / "recordings" / "filled"
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.write_text("in the way")
+    assert acknowledged() == [False, False]
+    folder.unlink()
+    assert acknowledged() == [True, True]
+    assert (folder / "walk-8.parquet").read_bytes() == b"rows"
+    socket.close()
+
+
 def test_a_revoked_agent_is_heard_no_more(service, context):
     from services.gateway.keys import KeyRing
 

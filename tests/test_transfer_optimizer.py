@@ -210,3 +210,5 @@ def test_a_search_is_over_once_no_walk_is_expected_to_gain_enough():
     fallen = suggest(search(eta, distance - 3.0), 47)
     assert fallen.gain == pytest.approx(known.gain, rel=0.3) and fallen.is_worth(0.5)
     assert suggest(search(eta[:2], distance[:2]), 3).is_worth(0.5), "uniform ones are made anyway"
+    alone = suggest(replace(search(eta[6:8], np.array([0.8, 0.8])), initial=1), 3)
+    assert alone.is_worth(0.5), "two distances that are alike tell nothing of the rest"

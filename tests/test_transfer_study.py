@@ -115,6 +115,16 @@ def test_a_result_counts_once_and_the_first_one():
     assert verdict is Verdict.REPEATED and again == trial and trial.result.distance == 0.7
 
 
+def test_a_walk_that_was_cancelled_does_not_count():
+    """It had ended before its robot heard of it; whoever cancelled it had a reason."""
+    trial, ticket = handed_out()
+    ended, verdict = trial.recall().finish(ticket, Result(S.SUCCEEDED, 0.7, 15.0), 15.0)
+    assert verdict is Verdict.COUNTED
+    assert ended.state is S.ABORTED and ended.result.reason == "cancelled"
+    fallen, _ = trial.recall().finish(ticket, Result(S.INFEASIBLE, reason="bad target"), 15.0)
+    assert fallen.state is S.INFEASIBLE
+
+
 def test_a_result_after_the_lease_is_late():
     trial, ticket = handed_out()
     trial = trial.expire()

@@ -33,6 +33,8 @@ NEARBY = 128
 """Etas around the best ones so far."""
 STARTS = 4
 """Best of them, from which the acquisition is climbed."""
+FEWEST = 4
+"""Walks before which no search is over: distances that are alike may be so by chance."""
 SAMPLES = 64
 """Draws of the process that expected improvement is averaged over."""
 
@@ -142,10 +144,14 @@ class Decision:
     def is_worth(self, least: float) -> bool:
         """Whether a walk is expected to gain enough; always while nothing walks forward.
 
+        So it is while there are few walks: what they tell of the rest is not known to be right.
+
         Args:
           least: gain as a share of the best eta's distance.
         """
-        return self.gain is None or self.best is None or self.gain >= least * self.best
+        if self.gain is None or self.best is None or self.walks < FEWEST:
+            return True
+        return self.gain >= least * self.best
 
 
 def suggest(search: Search, number: int) -> Decision:

@@ -265,7 +265,10 @@ class Trial:
         return replace(self, state=state), Verdict.COUNTED
 
     def finish(self, ticket: Ticket, result: Result, horizon: float) -> tuple["Trial", Verdict]:
-        """Hear how it ended. A success without a distance that can be is no result of eta.
+        """Hear how it ended.
+
+        A success without a distance that can be is no result of eta, nor is one of a walk that
+        somebody had cancelled.
 
         Args:
           ticket: of who tells.
@@ -279,6 +282,8 @@ class Trial:
         if result.state is S.SUCCEEDED and not far <= farthest(horizon):
             why = f"no distance that can be was measured: {result.distance}"
             result = replace(result, state=S.ABORTED, reason=why)
+        if result.state is S.SUCCEEDED and self.cancelled:  # it had ended before it was told
+            result = replace(result, state=S.ABORTED, reason="cancelled")
         return replace(self, state=result.state, result=result), Verdict.COUNTED
 
     def expire(self) -> "Trial":

@@ -20,6 +20,8 @@ from services.gateway.store import Answer, Store
 COOKIE = "pup_token"
 BODY_LIMIT = 4 * 2**20
 """Of a request, bytes."""
+UNKNOWN, CHALLENGE = "a valid bearer token is needed", {"WWW-Authenticate": "Bearer"}
+"""What somebody is told who has none."""
 _bearer = HTTPBearer(auto_error=False, description="A token of `pup serve token`.")
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]
 
@@ -45,8 +47,7 @@ def needs(role: Role) -> Any:
     ) -> User:
         found = asking(request)
         if found is None:
-            headers = {"WWW-Authenticate": "Bearer"}
-            raise HTTPException(401, "a valid bearer token is needed", headers)
+            raise HTTPException(401, UNKNOWN, CHALLENGE)
         if found.role < role:
             name = role.name.lower()
             raise HTTPException(

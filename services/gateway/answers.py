@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
 
+from services.gateway.access import asking
 from services.gateway.conductor import Conductor
 
 STREAM = 15.0
@@ -33,7 +34,9 @@ def stream(request: Request, name: str) -> Response:
     async def told() -> AsyncIterator[str]:
         revision = conductor.revision[name]
         yield f"retry: 2000\ndata: {revision}\n\n"
-        while not await request.is_disconnected() and not request.app.state.stopping:
+        while not (await request.is_disconnected() or request.app.state.stopping):
+            if asking(request) is None:  # the token was revoked meanwhile
+                return
             now = await conductor.wait(name, revision, STREAM)
             yield f"data: {now}\n\n" if now != revision else "event: alive\ndata: {}\n\n"
             revision = now

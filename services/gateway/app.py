@@ -15,7 +15,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from pup.transfer import orders
 from pup.transfer.study import Study, StudySettings
 from services.gateway import job_routes, lab_pages, names, pages, problems
-from services.gateway.access import BODY_LIMIT, IdempotencyKey, IdempotentRoute, needs
+from services.gateway.access import (
+    BODY_LIMIT,
+    CHALLENGE,
+    UNKNOWN,
+    IdempotencyKey,
+    IdempotentRoute,
+    asking,
+    needs,
+)
 from services.gateway.answers import as_json, conductor_of, stream
 from services.gateway.conductor import Conductor
 from services.gateway.dispatcher import Dispatcher
@@ -148,6 +156,9 @@ class _Guard:
             return problem(411, "a Content-Length is needed", Request(scope))
         if int(length) > BODY_LIMIT:
             return problem(413, f"more than {BODY_LIMIT} bytes", Request(scope))
+        reads = scope["path"].startswith("/v1/") and scope["method"] == "POST"
+        if reads and asking(Request(scope)) is None:  # a body of a stranger is not even read
+            return problem(401, UNKNOWN, Request(scope), **CHALLENGE)
         return None
 
 

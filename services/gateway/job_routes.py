@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, PlainTextResponse, Response, Streami
 from pydantic import BaseModel, Field
 
 from services.gateway import names
-from services.gateway.access import IdempotencyKey, IdempotentRoute, needs
+from services.gateway.access import IdempotencyKey, IdempotentRoute, asking, needs
 from services.gateway.answers import as_json, stream
 from services.gateway.dispatcher import LIST, Dispatcher
 from services.gateway.jobs import Job, JobState
@@ -222,7 +222,7 @@ async def get_logs(
             while chunk := await asyncio.to_thread(_read, path, at):
                 at += len(chunk)
                 yield chunk
-            if over or not follow or request.app.state.stopping:
+            if over or not follow or request.app.state.stopping or asking(request) is None:
                 return
             await asyncio.sleep(FOLLOW)
 

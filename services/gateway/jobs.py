@@ -247,5 +247,5 @@ def _end(job: Job, state: JobState, reason: str, now: float, outcome: str = "") 
 
 
 def _line(message: str) -> str:
-    """The last line of a message, cut."""
-    return (message.strip().splitlines() or [""])[-1].strip()[:300]
+    """The last line of a message, cut; without zeros, which no database keeps."""
+    return (message.replace("\0", "").strip().splitlines() or [""])[-1].strip()[:300]

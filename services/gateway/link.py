@@ -70,6 +70,7 @@ class Link:
         self.socket = self.context.socket(zmq.ROUTER)
         self.bound = False
         self._files: Stamp | None = None
+        self._lacking: set[tuple[str, str | None]] = set()
         self._queues: dict[str, asyncio.Queue[Message]] = {}
         self._workers: list[asyncio.Task[None]] = []
 
@@ -133,7 +134,7 @@ class Link:
             except WireError as error:
                 self.conductor.metrics.refused.labels("malformed").inc()
                 log.warning("message refused", extra={"why": str(error)})
-            except asyncio.QueueFull:
+            except asyncio.QueueFull:  # an end that is not acknowledged is sent again, and all
                 self.conductor.metrics.refused.labels("too many").inc()
             except Exception:  # what one agent says must not end the others' link
                 log.exception("message failed")
@@ -234,9 +235,10 @@ class Link:
                     self.conductor.notify(sample.trial.rpartition("/")[0])
             case Finished() as finished:
                 await self.conductor.finished(agent, finished)
-                self._acknowledge(agent, message)
+                if (agent, finished.recording) not in self._lacking:
+                    self._acknowledge(agent, message)
             case RecordingChunk() as piece:
-                await asyncio.to_thread(self._keep, agent, piece)
+                await self._kept(agent, piece)
                 self._acknowledge(agent, message)
             case other:
                 raise WireError(f"{type(other).__name__} is not for a gateway")
@@ -252,22 +254,33 @@ class Link:
         )
         self.send(agent, Acknowledge(message.id, *ticket))
 
-    def _keep(self, agent: str, piece: RecordingChunk) -> None:
-        """Keep a piece of a recording; join them when all are there."""
+    async def _kept(self, agent: str, piece: RecordingChunk) -> None:
+        """Keep a piece, and know which recordings are not whole: their ends are owed still."""
         if not RECORDING.fullmatch(piece.recording):
             raise WireError("no id of a recording")
         if not piece.number < piece.of <= PIECES_LIMIT or len(piece.data) > CHUNK:
             raise WireError(f"piece {piece.number} of {piece.of}, {len(piece.data)} bytes")
+        whole = False
+        try:
+            whole = await asyncio.to_thread(self._keep, agent, piece)
+        finally:
+            known = self._lacking.discard if whole else self._lacking.add
+            known((agent, piece.recording))
+
+    def _keep(self, agent: str, piece: RecordingChunk) -> bool:
+        """Keep a piece of a recording and join them when all are there; whether they are."""
         folder = self.config.data / "recordings" / agent
         whole, parts = folder / f"{piece.recording}.parquet", folder / f".{piece.recording}.parts"
         if whole.exists():
-            return
+            return True
         write_atomic(parts / f"{piece.number:04d}-{piece.of:04d}", piece.data)
         files = sorted(parts.glob(f"*-{piece.of:04d}"))
-        if len(files) == piece.of:
-            write_atomic(whole, b"".join(f.read_bytes() for f in files))
-            for file in parts.iterdir():
-                os.unlink(file)
-            parts.rmdir()
-            digest = sha256(whole)
-            log.info("recording", extra={"agent": agent, "file": str(whole), "sha256": digest})
+        if len(files) < piece.of:
+            return False
+        write_atomic(whole, b"".join(f.read_bytes() for f in files))
+        for file in parts.iterdir():
+            os.unlink(file)
+        parts.rmdir()
+        digest = sha256(whole)
+        log.info("recording", extra={"agent": agent, "file": str(whole), "sha256": digest})
+        return True

@@ -88,7 +88,7 @@ class Retry(Strict):
 class Reason(Strict):
     """Why, in words."""
 
-    reason: Annotated[str, Field(min_length=1, max_length=500)]
+    reason: Annotated[str, Field(min_length=1, max_length=500, pattern=r"^[^\x00]+$")]
 
 
 class StudyShape(BaseModel):

@@ -195,6 +195,8 @@ class Store:
     def _take_over(self, connection: sa.Connection) -> int:
         table = self.tables["gateways"]
         last = connection.execute(sa.select(sa.func.max(table.c.epoch))).scalar() or 0
+        before = sa.update(table).where(table.c.epoch == last)
+        connection.execute(before.values(started=table.c.started))  # waits for its last commit
         connection.execute(sa.insert(table).values(epoch=last + 1, started=time.time()))
         return last + 1
 
