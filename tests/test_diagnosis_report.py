@@ -380,4 +380,6 @@ def test_why_finalists_fell_behind(backlash: Diagnosis) -> None:
     lost = replace(other, outside=0.1 * other.inside)
     assert summary.why_behind(lost, best) == "fits these motions but does not predict others"
     near = replace(other, probability=0.2)
-    assert "hardly to be told apart" in summary.why_behind(near, best)
+    assert summary.why_behind(near, best) == "explains about as much"
+    same = replace(near, score=best.score)
+    assert "hardly to be told apart: 100 %" in summary.why_behind(same, best)

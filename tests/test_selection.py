@@ -16,6 +16,7 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import LOST
 from pup.diagnosis.starts import Tried
+from pup.physics.terms import Place
 from pup.robot import RobotDescription
 from tests.diagnoses import ENOUGH, Maker
 
@@ -131,6 +132,40 @@ class TestTheLast:
         rounds = [chosen(made((), 1000.0), self.found, made((OTHER,), 705.0))]
         assert Made(self.worths)._swap(self.found, rounds) is None
         assert Made({(OTHER,): 0.0})._swap(self.found, rounds) is None
+
+
+def test_two_forms_of_one_class_do_not_make_each_other_needless() -> None:
+    """What each is worth is seen without the other, which would make up for it."""
+    place = next(h.place for h in hypotheses(MAKER.measured) if h.effect == "coulomb_friction")
+    dry, other = (
+        next(h for h in hypotheses(MAKER.measured) if h.effect == effect and h.place == place)
+        for effect in ("coulomb_friction", "presliding_hysteresis")
+    )
+    model = MAKER.model(LAST, 1.0)
+    fit = replace(model.fit, chi2=100.0)
+    selector = Made({})
+    both = replace(model, hypotheses=(dry, other), fit=fit)
+    assert all(fit is selector.nominal.fit for fit in selector.without_class(both))
+    three = replace(model, hypotheses=(dry, LAST, other), fit=fit)
+    alone = [replace(fit, chi2=worth) for worth in (110.0, 900.0, 120.0)]
+    selector.without = lambda model: alone  # type: ignore[method-assign]
+    first, last, second = selector.without_class(three)
+    assert last is alone[1]
+    assert first is second and all(first is not fit for fit in alone)
+
+
+def test_places_that_hold_all_joints_are_told_once() -> None:
+    """A group of all joints is the robot, or its bus, where an effect can be there."""
+    measured = replace(MAKER.measured, robot=one_group(MAKER.robot))
+    places = {h.key for h in hypotheses(measured)}
+    assert ("coulomb_friction", Place("robot")) in places
+    assert ("coulomb_friction", Place("group", "leg")) not in places
+    assert ("coulomb_friction", Place("group", "knee")) not in places
+
+
+def one_group(robot: RobotDescription) -> RobotDescription:
+    joints = tuple(replace(joint, group="leg") for joint in robot.joints)
+    return replace(robot, joints=joints, groups=("leg",))
 
 
 def test_an_effect_that_was_given_up_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:

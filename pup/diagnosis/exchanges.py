@@ -80,7 +80,7 @@ class Exchanger(Selector):
         known_as = replace(model, hypotheses=(*before.hypotheses, given_up))
         holds, others = self.parted(before, [*holds[1:], *others, known_as])
         ranking = chosen_in(rounds, given_up.key).ranking
-        return Round(before, ranking, (better, *holds, *others), 1 + len(holds))
+        return Round(before, ranking, (better, *holds, *others), 1 + len(holds), again=True)
 
     def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
         """Models with a rival in place of an effect, and which of them that is."""
@@ -145,7 +145,7 @@ class Exchanger(Selector):
         holds, rest = self.parted(before, self.models(tried))
         known_as = replace(self.ended(model), hypotheses=(*others, hypothesis))
         holds = sorted([known_as, *holds], key=lambda m: m.worth)
-        return Round(before, chosen.ranking, (*holds, *rest), len(holds))
+        return Round(before, chosen.ranking, (*holds, *rest), len(holds), again=True)
 
     def _likely(
         self, chosen: Round, known: Collection[tuple[str, Place]]

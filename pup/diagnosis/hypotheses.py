@@ -19,6 +19,9 @@ FROM_OUTSIDE = frozenset(("external_force",))
 """Effects of a wrench: on the torso where it is free, else on links. One joint alone cannot tell a
 force on its link from a centre of mass elsewhere."""
 
+EVERYWHERE = ("robot", "bus")
+"""Kinds of places that all servos are at."""
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -45,6 +48,11 @@ class Hypothesis:
     def key(self) -> tuple[str, Place]:
         """What it claims, whatever its shape."""
         return self.effect, self.place
+
+    def sibling_of(self, other: "Hypothesis") -> bool:
+        """Whether both are forms of one class at one place; each is its own sibling."""
+        everywhere = self.place.kind in EVERYWHERE and other.place.kind in EVERYWHERE
+        return self.family == other.family and (self.place == other.place or everywhere)
 
     @property
     def form(self) -> tuple[float, ...]:
@@ -151,8 +159,11 @@ def _places(effect: str, measured: Measured) -> Iterator[Place]:
             yield from (Place("joint", name) for name in robot.joint_names)
         elif kind == "group":
             members = np.bincount(robot.group_index, minlength=len(robot.groups))
+            whole = len(robot.joints) if set(kinds) & set(EVERYWHERE) else np.inf  # told once
             yield from (
-                Place("group", g) for g, n in zip(robot.groups, members, strict=True) if n > 1
+                Place("group", g)
+                for g, n in zip(robot.groups, members, strict=True)
+                if 1 < n < whole
             )
         elif kind == "body":
             yield from _bodies(effect, measured, ground)

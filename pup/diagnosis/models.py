@@ -63,12 +63,15 @@ class Round:
       ranking: what the score test said, best first.
       finalists: the models refitted, best first: those that hold, then the others.
       holding: how many of them hold; with any, the first was added.
+      again: whether an effect was compared with its rivals once more, beside what was found later;
+        its ranking is that of before.
     """
 
     before: Model
     ranking: tuple[Score, ...]
     finalists: tuple[Model, ...]
     holding: int
+    again: bool = False
 
     @property
     def accepted(self) -> bool:

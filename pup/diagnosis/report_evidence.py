@@ -56,8 +56,10 @@ def evidence(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
         if len(diagnosis.rounds) > 1:
             known = [speech.short(h.effect, h.place) for h in chosen.before.hypotheses]
             beside = f", beside {listed(known)}" if known else ""
-            yield tag("h3", f"Round {number}{beside}")
-        yield from _ranking(diagnosis, speech, chosen.ranking, chosen)
+            again = ", compared again" if chosen.again else ""
+            yield tag("h3", f"Round {number}{again}{beside}")
+        if not chosen.again:
+            yield from _ranking(diagnosis, speech, chosen.ranking, chosen)
         yield from _refits(diagnosis, speech, chosen)
 
 

@@ -54,6 +54,8 @@ def otherwise(finding: Finding, speech: Speech) -> str:
     rest = [
         f"{speech.words(a.effect, a.place)} ({percent(a.probability)})" for a in finding.equivalents
     ]
+    if not rest and finding.probability <= 0.5:
+        return f"{own}: so much is left that its cause may as well have another name."
     if not rest:
         return f"{own}. No other effect of the library explains these motions nearly as well."
     return f"{own}. These motions would also fit {listed(rest)}."

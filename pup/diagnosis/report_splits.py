@@ -33,8 +33,8 @@ _HALVES = {
     "fast": ("fast / slow", "in fast motion", "in slow"),
     "slow": ("slow / fast", "in slow motion", "in fast"),
     "in the air": ("air / ground", "in the air", "on the ground"),
-    "loaded": ("loaded / unloaded", "in loaded recordings", "in unloaded ones"),
-    "unloaded": ("unloaded / loaded", "in unloaded recordings", "in loaded ones"),
+    "loaded": ("high / low torque", "in recordings of high torque", "in those of low torque"),
+    "unloaded": ("low / high torque", "in recordings of low torque", "in those of high torque"),
     "late": ("late / early", "late in a recording", "early in it"),
     "early": ("early / late", "early in a recording", "late in it"),
 }

@@ -7,6 +7,7 @@ by more than chance and predict types of motion that were left out; then each is
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +130,25 @@ class Selector:
             fit_together(known, self.replays, self.noise, iterations=ROUGH)
             self._lesser = model, known
         return known
+
+    def without_class(self, model: Model) -> list[Fit]:
+        """The model refitted without each of its effects and all forms of that one's class there.
+
+        What is there may act in a form between two of the library, each of which hardly matters
+        beside the other.
+        """
+        classes = [
+            [h for h in model.hypotheses if h.sibling_of(hypothesis)]
+            for hypothesis in model.hypotheses
+        ]
+        if len(classes[0]) == len(model.hypotheses):
+            return [self.nominal.fit] * len(classes)
+        fits = self.without(model)
+        told = [fit if len(own) == 1 else None for fit, own in zip(fits, classes, strict=True)]
+        apart = {own[0]: own for own in classes if len(own) > 1}
+        fewer = {first: reduce(less, own, model.fit) for first, own in apart.items()}
+        fit_together(list(fewer.values()), self.replays, self.noise, iterations=ROUGH)
+        return [fit or fewer[own[0]] for fit, own in zip(told, classes, strict=True)]
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit

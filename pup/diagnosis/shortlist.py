@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 
 from pup.diagnosis.evidence import Score
+from pup.diagnosis.hypotheses import EVERYWHERE
 from pup.physics.terms import Place
 
 FINALISTS = 8
 """Hypotheses refitted in each round, beside those of the best one's class."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
-EVERYWHERE = ("robot", "bus")
-"""Kinds of places that all servos are at."""
 
 
 def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:

@@ -26,6 +26,8 @@ FEWEST = 8
 """Samples below which a cell of a map stays empty."""
 SAME = 0.99
 """A finalist that explains this share of what the best one does predicts as well."""
+ALIKE = 0.8
+"""Overlap from which traces are told to be alike."""
 POWER = 1.28
 """An effect this many standard deviations above the threshold is found nine times in ten."""
 LONGEST = 4.0
@@ -221,8 +223,10 @@ def why_behind(rival: Rival, best: Rival) -> str:
         return "fits these motions but does not predict others"
     if not rival.holds:
         return "explains too little of what is left to be more than a wrong form of the others"
-    if rival.probability >= WORTH_SAYING:
+    if rival.probability >= WORTH_SAYING and same >= ALIKE:
         return f"hardly to be told apart: {100 * same:.0f} % the same trace"
+    if rival.probability >= WORTH_SAYING:
+        return "explains about as much"
     if rival.outside >= SAME * best.outside:
         return "predicts as well, but fits worse or needs more free numbers"
     return f"explains {100 * (1 - rival.outside / best.outside):.0f} % less of motions left out"

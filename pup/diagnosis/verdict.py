@@ -17,7 +17,6 @@ from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector
-from pup.diagnosis.shortlist import EVERYWHERE
 from pup.physics.terms import TERMS, Place, split_column
 
 Array = NDArray[np.float64]
@@ -131,18 +130,12 @@ def probabilities(models: Sequence[Model], before: Model, noise: Noise) -> Array
     worth -= worth.min()
     weights = np.exp(-worth / (2 * TEMPERATURE + BLUR * left_over(models[0], noise)))
     best = models[0].hypotheses[-1]
-    siblings = np.array([_sibling(m.hypotheses[-1], best) for m in models])
+    siblings = np.array([m.hypotheses[-1].sibling_of(best) for m in models])
     explained = max(before.fit.chi2 - models[0].fit.chi2, 0.0)
     alike = siblings * np.exp(-worth / (2 * TEMPERATURE + FORM * explained))
     shared = OWN_FORM * weights[siblings].sum() * alike / alike.sum()
     weights = np.where(siblings, (1 - OWN_FORM) * weights, weights) + shared
     return np.asarray(weights / weights.sum())
-
-
-def _sibling(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two hypotheses are forms of one class at one place."""
-    everywhere = one.place.kind in EVERYWHERE and other.place.kind in EVERYWHERE
-    return one.family == other.family and (one.place == other.place or everywhere)
 
 
 def left_over(model: Model, noise: Noise) -> float:
@@ -189,8 +182,7 @@ def findings(
     nominal = selector.nominal
     left = left_over(final, selector.noise)
     told = []
-    lesser = [nominal.fit] if len(final.hypotheses) == 1 else selector.without(final)
-    for hypothesis, less in zip(final.hypotheses, lesser, strict=True):
+    for hypothesis, less in zip(final.hypotheses, selector.without_class(final), strict=True):
         assert less.residual is not None and final.fit.residual is not None
         squares = less.residual**2 - final.fit.residual**2
         gain = less.chi2 - final.fit.chi2
