@@ -27,6 +27,7 @@ from pup.recording_rules import (
     check_extra,
     check_joints,
     check_metadata,
+    check_units,
     check_values,
 )
 from pup.robot import RobotDescription
@@ -135,10 +136,10 @@ class Recording:
         return digest.hexdigest()
 
     def validate(self, robot: RobotDescription) -> None:
-        """Check that the recording is of this robot: exactly its joints, knobs it has, its base.
+        """Check that the recording is of this robot: its joints, name, base, knobs and units.
 
         Raises:
-          InputError: a joint, a knob or the support does not fit.
+          InputError: one of them does not fit.
         """
         unknown = [name for name in self.joints if name not in robot.joint_names]
         absent = [name for name in robot.joint_names if name not in self.joints]
@@ -149,6 +150,11 @@ class Recording:
                 f"recording {self.id!r} (of robot {self.robot!r}): {' and '.join(told)} for robot "
                 f"{robot.name!r}; a recording must cover exactly the robot's joints"
             )
+        if self.robot != robot.name:
+            raise InputError(
+                f"recording {self.id!r} is of robot {self.robot!r}, not of {robot.name!r}; name "
+                "that one with --robot, or import the logs again for this one"
+            )
         wrong = "bench" if robot.floating else "ground"
         if self.support == wrong:
             base, right = ("free", "suspended") if robot.floating else ("fixed", "bench")
@@ -158,6 +164,7 @@ class Recording:
             )
         try:
             robot.setup(self.setup)
+            check_units(robot.joints, dict(self.columns()))
         except InputError as error:
             raise InputError(f"recording {self.id!r}: {error}") from error
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from pup.errors import InputError
 from pup.recording import Recording
 
+Array = NDArray[np.float64]
+
 FEWEST = 2
 """Rows that a part must have."""
 
@@ -16,7 +18,8 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
     """A stretch of a recording; its time starts again at 0.
 
     Where the stretch starts, its replay starts from rest, or from the speeds that were read: cut
-    where the robot stands still.
+    where the robot stands still. Commands that stand only where they change are written out, for
+    the stretch must know what was held when it began.
 
     Args:
       recording: the whole.
@@ -34,7 +37,7 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
             f"recording {recording.id!r}: {start:g} to {stop:g} s holds {kept.sum()} rows; "
             f"it lasts {since[-1]:g} s"
         )
-    part = _rows(recording, kept)
+    part = _rows(_with_commands(recording), kept)
     return replace(
         part,
         id=id or f"{recording.id}_{start:g}s",
@@ -59,6 +62,21 @@ def _rows(recording: Recording, kept: NDArray[np.bool_]) -> Recording:
         position=recording.position[kept],
         extras={name: values[kept] for name, values in recording.extras.items()},
     )
+
+
+def _with_commands(recording: Recording) -> Recording:
+    """The recording with the commands that each row holds; before the first one there is none."""
+    extras = dict(recording.extras)
+    if "torque_enabled" in extras:
+        extras["torque_enabled"] = _held(extras["torque_enabled"])
+    return replace(recording, target=_held(recording.target), extras=extras)
+
+
+def _held(values: Array) -> Array:
+    """Values of shape (n_ticks, ...), each missing one as the one before it."""
+    rows = np.arange(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    last = np.maximum.accumulate(np.where(np.isnan(values), 0, rows), axis=0)
+    return np.asarray(np.take_along_axis(values, last, axis=0))
 
 
 def thinned(recording: Recording, every: int) -> Recording:

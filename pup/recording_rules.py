@@ -4,13 +4,14 @@ Rows are counted from 0. A message says what and where in the recording; the cal
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.robot_parts import Joint
 
 Array = NDArray[np.float64]
 
@@ -22,6 +23,10 @@ IMU = tuple(f"imu/{sensor}_{axis}" for sensor in ("gyro", "accel") for axis in "
 WHOLE = ("voltage", "torque_enabled", "imu/roll", "imu/pitch", "imu/yaw", *IMU)
 
 MAX_DURATION = 86_400.0  # s; longer means other units or a clock that jumped
+MAX_TICK = 0.5  # s; no servo is driven as slowly, but a clock in ms looks so
+BEYOND, MARGIN = 4.0, 2.0
+"""Play, a fall or a turn of its servo may bring a joint beyond its limits, but not beyond so many
+times the larger one, and so much more, rad; degrees and encoder ticks are."""
 
 
 def check_metadata(metadata: object) -> dict[str, Any]:
@@ -115,6 +120,28 @@ def _check_time(time: Array) -> None:
         raise InputError(
             f"column 'time' spans {time[-1] - time[0]:g} s; is it in seconds, did the clock jump?"
         )
+
+
+def check_units(joints: Sequence[Joint], columns: Mapping[str, Array]) -> None:
+    """Refuse what cannot be in s and rad (of a slide in m), by the robot's joints.
+
+    Args:
+      joints: of the robot.
+      columns: as for `check_values`, valid.
+    """
+    tick = float(np.median(np.diff(columns["time"])))
+    if tick > MAX_TICK:
+        raise InputError(f"column 'time': rows are {tick:g} s apart; is time in ms?")
+    for joint in joints:
+        largest = BEYOND * max(abs(joint.lower), abs(joint.upper)) + MARGIN
+        for name in (f"target/{joint.name}", f"position/{joint.name}"):
+            values = columns[name]
+            for row in np.flatnonzero(np.abs(values) > largest):
+                raise InputError(
+                    f"column {name!r}, row {row}: {values[row]:g}, but robot.toml limits the joint "
+                    f"to [{joint.lower:g}, {joint.upper:g}]; are these degrees, encoder ticks or "
+                    "mm?"
+                )
 
 
 def _check_setup(setup: object) -> None:

@@ -13,7 +13,7 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 def read_text(path: Path, limit: int) -> str:
-    """Read a UTF-8 text file of at most `limit` bytes.
+    """Read a UTF-8 text file of at most `limit` bytes; the mark that Notepad puts before it goes.
 
     Raises:
       InputError: the file is absent, too large or not UTF-8.
@@ -21,7 +21,7 @@ def read_text(path: Path, limit: int) -> str:
     try:
         if path.stat().st_size > limit:
             raise InputError(f"{path}: larger than {limit} bytes; is this the right file?")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -17,6 +17,12 @@ from pup.robot_toml import read_text
 WEIGHT = "phi/"
 
 
+def check_folder(robot: RobotDescription, folder: Path) -> None:
+    """Refuse to write a robot over the one that it comes from."""
+    if folder.resolve() == robot.folder.resolve():
+        raise InputError(f"{folder}: is the folder of {robot.name!r} itself; name another")
+
+
 def write_corrected(
     robot: RobotDescription,
     folder: Path,
@@ -46,8 +52,7 @@ def write_corrected(
       InputError: a parameter the robot does not have, a value or a term that is refused when read
         back, or the folder is the other robot's own.
     """
-    if folder.resolve() == robot.folder.resolve():
-        raise InputError(f"{folder}: is the folder of {robot.name!r} itself; name another")
+    check_folder(robot, folder)
     document = tomlkit.parse(read_text(robot.folder / "robot.toml", ROBOT_LIMIT))
     values = {name: float(value) for name, value in parameters.items()}
     for spec in robot.parameters:

@@ -43,6 +43,9 @@ def import_logs(verb: argparse.ArgumentParser) -> None:
         metavar="KNOB=NUMBER",
         help="what was knowingly changed on the robot, by its knobs",
     )
+    told.add_argument(
+        "--repeat-of", metavar="ID", help="of the recording that this one repeats; for one log"
+    )
     told.add_argument("--notes", default="", metavar="TEXT", help="kept with the recordings")
     told.add_argument(
         "--joints", metavar="A,B,...", help="joint names in column order (npz without names)"

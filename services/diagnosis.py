@@ -22,7 +22,7 @@ from pup.physics.parameters import robot_space
 from pup.physics.terms import Kind, split_column
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
-from pup.robot_writer import write_corrected
+from pup.robot_writer import check_folder, write_corrected
 from pup.sysid.problem import MODEL
 from services.provenance import versions
 from services.stopwatch import Stopwatch
@@ -86,6 +86,7 @@ def run_diagnosis(
       The document of `diagnosis.json`: that of the contract, and how many `seconds` it took from
       the first start on; `processor_seconds` too where all was done in this process.
     """
+    check_folder(robot, out / CORRECTED)  # told before hours of fits, and not after them
     kept = out / CHECKPOINTS
     watch = Stopwatch(kept / SPENT, _digest(robot, recordings))
     run = keeper(where, robot, kept)
@@ -154,9 +155,16 @@ def _clear(kept: Path) -> None:
 
 
 def _write_corrected(found: Diagnosis, out: Path) -> str:
-    """Write the robot as it was found to be; what is nominal stays as it was fitted."""
-    fit = found.model.fit if found.model else found.nominal.fit
-    write_fit(found.robot, fit, out / CORRECTED, "Corrected by `pup diagnose`.")
+    """Write the robot as it was found to be; what is nominal stays as it was fitted.
+
+    Where nothing can be said, it is the robot as it was: a fit that does not settle is no better.
+    """
+    if found.model is None:
+        notes = "As described: `pup diagnose` could tell nothing of it."
+        write_corrected(found.robot, out / CORRECTED, {}, found.robot.terms, notes)
+    else:
+        notes = "Corrected by `pup diagnose`."
+        write_fit(found.robot, found.model.fit, out / CORRECTED, notes)
     return str(out / CORRECTED)
 
 

@@ -228,8 +228,7 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _import(options: argparse.Namespace) -> dict[str, Any]:
-    from pup.importers import ImportOptions, import_recordings
-    from pup.recording import write_recordings
+    from pup.importers import ImportOptions, import_recordings, unknown_repeats, write_imported
 
     robot = RobotDescription.load(options.robot) if options.robot else None
     read = import_recordings(
@@ -241,6 +240,7 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
             motion=options.motion,
             support=options.support,
             source=options.source,
+            repeat_of=options.repeat_of,
             setup=_setup(options.setup),
             notes=options.notes,
             joints=tuple(options.joints.split(",")) if options.joints else (),
@@ -249,7 +249,10 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
         ),
     )
     with _folder(options.out) as out:
-        return {"recordings": [str(file) for file in write_recordings(read, out)]}
+        files = write_imported(read, out)
+        for one in unknown_repeats(read, out):
+            _tell(f"warning: {one.id!r} repeats {one.repeat_of!r}, which is not in {out}")
+        return {"recordings": [str(file) for file in files]}
 
 
 def _export(options: argparse.Namespace) -> dict[str, Any]:

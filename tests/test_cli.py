@@ -118,6 +118,19 @@ def test_import_takes_what_the_log_does_not_tell_from_the_options(tmp_path: Path
     }
 
 
+def test_import_says_what_a_recording_repeats(tmp_path: Path) -> None:
+    arm = ("--robot-name", "arm", "--motion", "step", "--support", "bench")
+    for name in ("first", "again"):
+        (tmp_path / f"{name}.csv").write_text(foreign_logs.CSV)
+    again = ("import", "csv", tmp_path / "again.csv", *arm, "--repeat-of", "first")
+    done = pup(*again, "--out", tmp_path)
+    assert done.code == 0
+    assert done.err == f"warning: 'again' repeats 'first', which is not in {tmp_path}\n"
+    assert Recording.read(tmp_path / "again.parquet").repeat_of == "first"
+    assert pup("import", "csv", tmp_path / "first.csv", *arm, "--out", tmp_path).code == 0
+    assert pup(*again, "--out", tmp_path).err == ""
+
+
 def test_presysid_writes_bounds_and_a_report(
     bench_recordings: Path, identified: Path, tmp_path: Path, check: Check
 ) -> None:

@@ -49,6 +49,22 @@ def _(place: Place) -> Made:
     return command, (logs[1], "id 'a'", "rename")
 
 
+@case("a log of the name of another one's recording")
+def _(place: Place) -> Made:
+    told = ("--robot", "servo_bench", *TOLD, "--out", place.here)
+    assert pup("import", "csv", place.write("1.csv", LOG), *told).code == 0
+    log = place.write("1.csv", LOG.replace("0.5", "0.6"))
+    words = (place.here / "1.parquet", "another recording", "rename the log")
+    return ["import", "csv", log, *told], words
+
+
+@case("two logs that repeat one recording")
+def _(place: Place) -> Made:
+    logs = [place.write(f"{name}.csv", LOG) for name in "ab"]
+    command = place.importing("csv", *logs, "--robot", "servo_bench", *TOLD, "--repeat-of", "c")
+    return command, ("--repeat-of", "one recording", "2")
+
+
 @case("a log that does not tell the motion")
 def _(place: Place) -> Made:
     log = place.write("x.csv", LOG)

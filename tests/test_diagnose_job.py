@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.replays import Batch, Bench, Replays, Runner, threads
 from pup.diagnosis.residuals import Measured
+from pup.errors import InputError
 from pup.physics.parameters import robot_space
 from pup.recording import write_recordings
 from pup.recording_cuts import beginning
+from pup.robot import RobotDescription
+from pup.robot_writer import write_corrected
 from services.diagnosis import Where, alone, keeper, run_diagnosis
 from services.stopwatch import Stopwatch
 
@@ -134,6 +137,14 @@ def test_checkpoints_of_another_job_are_left(tmp_path: Path) -> None:
     assert [file.name for file in kept.iterdir()] == ["nominal.npz"]
 
 
+def test_a_corrected_robot_is_not_diagnosed_into_its_own_folder(tmp_path: Path) -> None:
+    """This is said before anything is simulated."""
+    robot = write_corrected(BENCH, tmp_path / "corrected", {}, [])
+    nowhere = Where(lambda measured, actuator: pytest.fail("simulated"), 1, here=True)
+    with pytest.raises(InputError, match=r"corrected: is the folder of 'servo_bench' itself"):
+        run_diagnosis(robot, recordings({}, 1), tmp_path, nowhere, lambda stage, share: None)
+
+
 def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path) -> None:
     """Two sets of recordings under the same parameters are two questions."""
     asked: list[int] = []
@@ -168,3 +179,16 @@ def test_the_beginnings_of_recordings_can_be_taken_alone(tmp_path: Path) -> None
         cut = beginning(recording, 1.0)
         assert cut.time[-1] - cut.time[0] < 1.0 < recording.time[-1] - recording.time[0]
         assert cut.digest in page and recording.digest not in page
+
+
+def test_what_tells_nothing_corrects_nothing(tmp_path: Path) -> None:
+    """The robot is written as it was: a fit that says nothing is no better."""
+    write_recordings(recordings({}, 1)[:1], tmp_path / "runs")
+    done = pup("diagnose", tmp_path / "runs", *DIAGNOSE, "--local", "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    folder = tmp_path / "out" / "corrected"
+    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["verdict"] == (
+        "undetermined"
+    )
+    assert (folder / "robot.toml").read_text().startswith("# As described")
+    assert RobotDescription.load(str(folder)).parameters == BENCH.parameters

@@ -89,3 +89,11 @@ def test_what_is_wrong_with_recordings_and_how_to_mend_it_is_said(
     assert poor is not None
     assert why in poor.reason
     assert cure in poor.cure and bool(cure) == bool(poor.cure)
+
+
+def test_of_a_joint_that_slides_it_is_said_in_metres() -> None:
+    axis, time = RobotDescription.load("emps"), np.arange(0, 3, 0.03)
+    still = np.zeros((len(time), 1))
+    run = Recording("still", "emps", "hold", "bench", "hardware", ("axis",), time, still, still)
+    poor = why_poor(Measured.of(axis, [run, replace(run, id="again")]))
+    assert poor is not None and poor.reason == "no joint moves by more than 0.0029 m"

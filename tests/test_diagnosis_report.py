@@ -295,6 +295,11 @@ def test_report_of_undetermined(bench: Maker, tmp_path: Path) -> None:
     advised = page(bare, tmp_path, {"next_recording": NEXT})
     assert "Record at least two types of motion" not in advised.text
     assert "a slow triangle" in advised.text
+    unfitted = replace(nominal, certificate=Certificate((100.0,), False, 0.0))
+    shown = page(replace(bare, nominal=unfitted), tmp_path)
+    assert "Nothing was fitted" in shown.text and "do not agree" not in shown.text
+    assert "robot as it is described" in shown.text and "not made" in shown.text
+    assert "Nominal parameters, with" not in shown.text
 
 
 @pytest.mark.usefixtures("undrawn")

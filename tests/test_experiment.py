@@ -82,6 +82,11 @@ def test_where_motions_tell_nothing_another_one_is_asked_for() -> None:
     assert told.document()["splits"] == []
 
 
+def test_of_steps_those_that_move_the_joints_come_first() -> None:
+    told = recorded_besides(measured_under(BENCH, {}, ("triangle",), 1.0))
+    assert (told.motion, told.words) == ("step", "steps of 0.3 rad")
+
+
 def test_where_recordings_are_spoilt_the_same_is_asked_for_again() -> None:
     told = recorded_again(measured_under(BENCH, {}, ("hold",), 1.0), "read at 20 Hz or faster")
     assert told.motion == "hold"

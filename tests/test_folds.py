@@ -33,6 +33,19 @@ def test_a_motion_done_again_is_left_out_with_it() -> None:
     assert left_out(alike[:2]) == [[0], [1]]  # there is nothing else
 
 
+def test_who_repeats_a_repeat_repeats_the_first() -> None:
+    def families(*told: tuple[str, str | None]) -> list[list[int]]:
+        runs = [replace(RUNS[0], id=name, repeat_of=before) for name, before in told]
+        return list(Measured.of(BENCH, runs).families().values())
+
+    assert families(("a", None), ("b", "a"), ("c", "b"), ("d", None)) == [[0, 1, 2], [3]]
+    assert families(("b", "absent"), ("c", "b"), ("d", "absent")) == [[0, 1, 2]]
+    assert families(("a", "c"), ("b", "a"), ("c", "b"), ("d", "d"), ("e", "a")) == [
+        [0, 1, 2, 4],
+        [3],
+    ]
+
+
 def test_a_motion_done_often_makes_no_interval_narrower() -> None:
     """Of two motions one is predicted worse, however often it is done."""
     maker = Maker(RobotDescription.load("servo_bench"), motions=["step"] * 9)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -24,7 +25,7 @@ from foreign_logs import (
 from mcap.writer import CompressionType
 
 from pup.errors import InputError
-from pup.importers import ImportOptions, import_recordings
+from pup.importers import ImportOptions, import_recordings, write_imported
 from pup.importers.common import join
 from pup.importers.darwin_hardware import JOINTS
 from pup.recording import load_recordings
@@ -188,6 +189,19 @@ def test_csv_takes_metadata_from_options_or_its_first_line(tmp_path: Path) -> No
     path.write_text(f"# pup.recording: {json.dumps(told)}\r\n" + CSV.replace("\n", "\r\n"))
     assert one("csv", path).metadata() == told
     assert one("csv", path, ImportOptions(motion="hold")).motion == "hold"
+
+
+def test_what_was_imported_is_written_again_only_where_it_is_the_same(tmp_path: Path) -> None:
+    (tmp_path / "1.csv").write_text(CSV)
+    first = import_recordings("csv", [tmp_path / "1.csv"], options=ARM)
+    (written,) = write_imported(first, tmp_path / "out")
+    before = written.read_bytes()
+    assert write_imported(first, tmp_path / "out") == (written,)
+    more = import_recordings("csv", [tmp_path], options=replace(ARM, motion="triangle"))
+    beside = [replace(first[0], id="0"), *more]
+    with pytest.raises(InputError, match=r"1\.parquet: is another recording; rename the log"):
+        write_imported(beside, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == [written] and written.read_bytes() == before
 
 
 def test_csv_names_what_nobody_told(tmp_path: Path) -> None:

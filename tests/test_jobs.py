@@ -92,7 +92,7 @@ def test_paths_within_may_be_written_either_way(shared):
 def test_every_option_of_a_job_that_names_a_file_is_known_as_a_path():
     """A new option of a verb that takes a file as mere text would escape the check."""
     texts = {"robot", "robot_name", "motion", "notes", "joints", "state_topic", "command_topic"}
-    texts |= {"format", "motions", "address", "track", "fitted_to"}
+    texts |= {"format", "motions", "address", "track", "fitted_to", "repeat_of"}
     verbs = next(a for a in parser()._actions if a.dest == "name").choices
     for verb in VERBS:
         for action in verbs[verb]._actions:

@@ -171,13 +171,31 @@ def test_refuses_sets_that_are_empty_or_name_an_id_twice(tmp_path: Path) -> None
         load_recordings([tmp_path])
 
 
+SERVO = make(
+    robot="servo_bench", joints=("servo",), target=np.zeros((3, 1)), position=np.zeros((3, 1))
+)
+
+
 def test_validate_wants_exactly_the_robots_joints_and_knobs() -> None:
     robot = RobotDescription.load("servo_bench")
-    fitting = make(
-        joints=("servo",), target=np.zeros((3, 1)), position=np.zeros((3, 1)), setup={"kp": 32}
-    )
+    fitting = dataclasses.replace(SERVO, setup={"kp": 32})
     fitting.validate(robot)
     with pytest.raises(InputError, match="unknown joints a, b and joints servo not recorded"):
         make().validate(robot)
     with pytest.raises(InputError, match=r"recording 'r1': setup: 'colour' is no knob"):
         dataclasses.replace(fitting, setup={"colour": 1.0}).validate(robot)
+    with pytest.raises(InputError, match="'r1' is of robot 'arm', not of 'servo_bench'"):
+        dataclasses.replace(fitting, robot="arm").validate(robot)
+
+
+def test_validate_refuses_other_units_and_lets_a_robot_fall() -> None:
+    """The servo may go from -3.14 to 3.14 rad, and may be turned a few times as far."""
+    robot = RobotDescription.load("servo_bench")
+    turned = np.array([[0.0], [np.nan], [12.0]])
+    dataclasses.replace(SERVO, position=turned, time=[0.0, 0.4, 0.8]).validate(robot)
+    for kind in ("target", "position"):
+        far = dataclasses.replace(SERVO, **{kind: np.array([[0.0], [np.nan], [-57.3]])})
+        with pytest.raises(InputError, match=rf"'{kind}/servo', row 2: -57\.3, .* degrees"):
+            far.validate(robot)
+    with pytest.raises(InputError, match=r"'r1': column 'time': rows are 30 s apart; .* in ms"):
+        dataclasses.replace(SERVO, time=[0.0, 30.0, 60.0]).validate(robot)

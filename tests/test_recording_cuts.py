@@ -1,5 +1,7 @@
 """Parts of recordings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,20 @@ def test_stretches_side_by_side_are_the_whole() -> None:
     parts = [cut(WHOLE, start, stop, id=f"p{start}") for start, stop in ((0, 0.45), (0.45, 2))]
     assert [part.id for part in parts] == ["p0", "p0.45"]
     assert np.concatenate([p.target for p in parts]).tolist() == WHOLE.target.tolist()
+
+
+def test_a_stretch_knows_the_commands_that_were_held_when_it_began() -> None:
+    """Logs may have commands only where they change."""
+    nan = np.nan
+    sparse = replace(
+        WHOLE,
+        target=np.array([[nan, 0, nan, nan, nan, nan, 1, nan, nan, nan]]).T,
+        extras={"torque_enabled": np.array([1, nan, 0, nan, nan, nan, nan, 1, nan, nan])},
+    )
+    part = cut(sparse, 0.35, 0.85)
+    assert part.target[:, 0].tolist() == [0, 0, 1, 1, 1]
+    assert part.extras["torque_enabled"].tolist() == [0, 0, 0, 1, 1]
+    np.testing.assert_array_equal(cut(sparse, 0, 0.15).target[:, 0], [nan, 0])
 
 
 def test_a_stretch_without_rows_is_refused() -> None:

@@ -1,5 +1,9 @@
 """The built-in robots in MuJoCo: masses, mirror symmetry, stance, contacts, benches."""
 
+import re
+import shutil
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
+from pup.errors import InputError
+from pup.physics.model import compile_model
 from pup.robot import RobotDescription, built_in_robots
 
 DARWIN = RobotDescription.load("darwin_op2")
@@ -53,6 +59,33 @@ def test_every_built_in_model_compiles_and_has_the_joints(name: str) -> None:
     dofs = [model.joint(joint.name).dofadr[0] for joint in robot.joints]
     for field in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
         assert not field[dofs].any()
+
+
+RADIANS = ("model.xml", 'angle="radian"', "")
+DEGREES = ("robot.toml", "3.14", "180")
+NO_RANGE = ("model.xml", 'range="-3.1416 3.1416"', "")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ([RADIANS], "[-3.14, 3.14] is far beyond its range [-0.0548, 0.0548] rad in model.xml"),
+        ([DEGREES], "[-180, 180] is far beyond its range [-3.14, 3.14] rad in model.xml"),
+        ([DEGREES, NO_RANGE], "[-180, 180] is more than two turns"),
+    ],
+)
+def test_degrees_in_one_of_a_robots_files_are_refused(
+    tmp_path: Path, changes: list[tuple[str, str, str]], words: str
+) -> None:
+    folder = tmp_path / "robot"
+    shutil.copytree(RobotDescription.load("servo_bench").folder, folder)
+    for file, old, new in changes:
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=re.escape(words)) as error:
+        compile_model(RobotDescription.load(folder), "bench")
+    assert str(folder / "robot.toml") in str(error.value) and "degrees" in str(error.value)
 
 
 @pytest.mark.parametrize("name", built_in_robots())

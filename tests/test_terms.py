@@ -14,9 +14,11 @@ from pup.errors import InputError
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import ParameterSpace, robot_space
 from pup.physics.terms import CLASS_OF, CLASSES, TERMS, Place, column, term_space
+from pup.physics.terms.scale import Scale
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
+EMPS = RobotDescription.load("emps")
 SQUAT = np.array(OP2.poses["half_squat"])
 STOP = {"angle": -1.2, "side": 1.0}
 """Where the left knee meets a stop in the poses used here."""
@@ -230,3 +232,10 @@ def test_the_page_on_the_physics_tells_every_effect_and_quantity() -> None:
         (row,) = [line for line in page if line.startswith(start)]
         for quantity in term.quantities:
             assert f"`{quantity.name}`" in row
+
+
+@pytest.mark.parametrize(("robot", "angle"), [(EMPS, 0.145), (BENCH, 1.0), (LEG, 1.0)])
+def test_joints_that_slide_are_known_by_their_kind(robot: RobotDescription, angle: float) -> None:
+    """What a robot calls the unit of its forces does not matter."""
+    named = tuple(replace(spec, unit="?") for spec in robot.parameters)
+    assert Scale.of(replace(robot, parameters=named)).angle == pytest.approx(angle)

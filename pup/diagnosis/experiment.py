@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.fitting import Fit, difference, fit_together
 from pup.diagnosis.laws import WORDS, contract_name
-from pup.diagnosis.menu import Option, options
+from pup.diagnosis.menu import CHANGED, SCRIPTS, Option, options
 from pup.diagnosis.models import Round
 from pup.diagnosis.replays import Replays, Row
 from pup.diagnosis.residuals import Measured, Noise
@@ -205,6 +205,8 @@ def recorded_besides(measured: Measured, seed: int = 0) -> NextRecording:
       seed: of the motion.
     """
     menu = [o for o in options(measured.robot, seed) if o.plain]
+    well = {SCRIPTS[kind] for kind in CHANGED}  # the smallest steps hardly move a joint
+    menu.sort(key=lambda option: option.words not in well)
     known = measured.motions()
     option = next((o for o in menu if o.recording.motion not in known), menu[0])
     reason = f"{option.words}, beside what was recorded, moves the joints in another way"

@@ -76,6 +76,11 @@ class Certificate:
     samples: int = 0
 
     @property
+    def made(self) -> bool:
+        """Whether anything was fitted at all; see `unfitted`."""
+        return len(self.starts) > 1
+
+    @property
     def holds(self) -> bool:
         """Whether a verdict may be given."""
         found_again = self.recovered <= SELF or self.left < SHORT * self.samples

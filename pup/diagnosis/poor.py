@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.residuals import Measured
 from pup.physics.terms.scale import Scale
+from pup.sysid.accuracy import JointUnits
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,8 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
         for j in joints
     ]
     if max(moves) < MOTION * angle:
-        yield Poor(f"no joint moves by more than {MOTION:g} rad")
+        unit = JointUnits.of(measured.robot, measured.recordings).position
+        yield Poor(f"no joint moves by more than {MOTION * angle:.2g} {unit}")
     if len(measured.recordings) < 2:
         yield Poor("one recording leaves nothing to check a finding on; record a second motion")
     step = np.diff(measured.time)

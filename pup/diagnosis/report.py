@@ -268,7 +268,8 @@ class _Report:
             of = "" if len(named) == 1 else "of the least sure finding"
             yield "Probability", percent(min(named)), of or "that effect and place are right"
         if not diagnosis.nominal.certificate.holds:
-            yield "Nominal fit", "not converged", ""
+            made = diagnosis.nominal.certificate.made
+            yield "Nominal fit", "not converged" if made else "not made", ""
 
     def where(self) -> Iterator[Html]:
         """The robot with the places in colour."""

@@ -161,10 +161,12 @@ def maps(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     if not np.isfinite(before).any():
         return
     norm = misfit_norm(before)
+    fitted = diagnosis.nominal.certificate.made
+    model = "nominal model, fitted to all recordings" if fitted else "robot as it is described"
     yield tag(
         "p",
-        "Errors of the nominal model, fitted to all recordings, in units of the noise: 1 is noise "
-        "alone. Joints where the cause sits are not always those where it shows.",
+        f"Errors of the {model}, in units of the noise: 1 is noise alone. Joints where the cause "
+        "sits are not always those where it shows.",
     )
     if np.isfinite(inner).any():
         row, column = np.unravel_index(np.nanargmax(inner), inner.shape)

@@ -26,12 +26,15 @@ def nominal(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
         f"{len(diagnosis.measured.values):,} readings were compared with "
         f"{diagnosis.replays:,} simulations.",
     )
-    yield _parameters(diagnosis, speech)
+    if diagnosis.nominal.certificate.made:
+        yield _parameters(diagnosis, speech)
     yield _recordings(diagnosis, speech)
 
 
 def _certificate(diagnosis: Diagnosis) -> str:
     told = diagnosis.nominal.certificate
+    if not told.made:
+        return "Nothing was fitted: these recordings could not tell what is right."
     ends = ", ".join(f"{chi2:,.1f}" for chi2 in told.starts)
     text = (
         "An optimiser that stops short looks like missing physics, so the fit is checked twice. "
@@ -52,11 +55,11 @@ def _noise(diagnosis: Diagnosis, speech: Speech) -> str:
     spread = thousandths(float(sigma.min()))
     if len(read) > 1:
         spread += f" to {thousandths(float(sigma.max()))}"
-    source = (
-        "measured from what differs between repeats of one motion"
-        if noise.source == "repeats"
-        else "assumed from how readings flicker at rest, as no motion was repeated"
-    )
+    source = "assumed from how readings flicker at rest, as no motion was repeated"
+    if noise.source == "repeats":
+        source = "measured from what differs between repeats of one motion"
+    elif not diagnosis.nominal.certificate.made:
+        source = "assumed: what is usual of such sensors"
     text = f"Noise of the joints: {spread} {speech.units.small}, {source}"
     tilts = [c for c in summary.channels(diagnosis) if c >= joints]
     if tilts:

@@ -7,10 +7,10 @@ from pathlib import Path
 from pup.errors import InputError
 from pup.importers import bam, csv_format, darwin_hardware, emps, mcap_format, npz, sage
 from pup.importers.common import ImportOptions
-from pup.recording import Recording
+from pup.recording import Recording, write_recordings
 from pup.robot import RobotDescription
 
-__all__ = ["FORMATS", "ImportOptions", "import_recordings"]
+__all__ = ["FORMATS", "ImportOptions", "import_recordings", "unknown_repeats", "write_imported"]
 
 Importer = Callable[[Path, ImportOptions], list[Recording]]
 
@@ -78,7 +78,45 @@ def import_recordings(
                 )
             origin[recording.id] = path
         recordings += found
+    if options.repeat_of is not None and len(recordings) > 1:
+        raise InputError(
+            f"--repeat-of is of one recording, and here are {len(recordings)}; import it alone"
+        )
     return tuple(sorted(recordings, key=lambda recording: recording.id))
+
+
+def write_imported(recordings: Sequence[Recording], folder: Path) -> tuple[Path, ...]:
+    """Write recordings into a folder where others may stand, named by their ids: all or none.
+
+    Logs of two motions may bear one name, and the second must not take the place of the first.
+
+    Returns:
+      The files, in the order of the recordings.
+
+    Raises:
+      InputError: a file of such a name is there and holds something else.
+    """
+    for recording in recordings:
+        file = folder / f"{recording.id}.parquet"
+        if file.exists() and not _holds(file, recording):
+            raise InputError(
+                f"{file}: is another recording; rename the log, use another folder, or remove it"
+            )
+    return write_recordings(recordings, folder)
+
+
+def _holds(file: Path, recording: Recording) -> bool:
+    try:
+        return Recording.read(file).digest == recording.digest
+    except InputError:  # whatever it is, it is not this recording
+        return False
+
+
+def unknown_repeats(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
+    """Those that repeat a recording which is neither among them nor in a folder."""
+    known = {recording.id for recording in recordings}
+    known |= {file.stem for file in folder.glob("*.parquet")}
+    return [r for r in recordings if r.repeat_of is not None and r.repeat_of not in known]
 
 
 def _logs(paths: Sequence[Path], pattern: str) -> list[Path]:

@@ -27,6 +27,7 @@ class ImportOptions:
       motion: motion type.
       support: `suspended`, `ground` or `bench`.
       source: `hardware`, `simulation` or `unknown`.
+      repeat_of: id of the recording that the one of the file repeats.
       setup: knobs, added to those of the file.
       notes: added to the importer's own notes.
       joints: joint names in column order, where the file has none.
@@ -38,6 +39,7 @@ class ImportOptions:
     motion: str | None = None
     support: str | None = None
     source: str | None = None
+    repeat_of: str | None = None
     setup: Mapping[str, float] = field(default_factory=dict)
     notes: str = ""
     joints: tuple[str, ...] = ()
@@ -57,6 +59,8 @@ class ImportOptions:
                 known[key] = value
             elif key not in known:
                 raise InputError(f"the file does not tell the {key}; give it with --{key}")
+        if self.repeat_of is not None:
+            known["repeat_of"] = self.repeat_of
         if isinstance(known["setup"], dict):
             known["setup"] = known["setup"] | dict(self.setup)
         if self.notes:

@@ -50,6 +50,12 @@ class Model:
     contacts: tuple[tuple[int, int], ...]
 
 
+BEYOND, MARGIN = 2.0, 0.5
+"""Limits of a hinge in robot.toml may be so many times the larger end of its range in the MJCF, and
+so much more, rad; degrees beside radians are further apart."""
+TURNS = 4 * np.pi
+"""Limits that a hinge without a range may have, rad."""
+
 Extension = Callable[[RobotDescription, mujoco.MjSpec], None]
 
 
@@ -99,6 +105,7 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
             f"robot {robot.name!r} has a fixed base and cannot be on the ground; "
             "the recording's support should be 'bench'"
         )
+    _check_limits(robot, compiled)
     ids = [compiled.joint(name).id for name in robot.joint_names]
     return Model(
         compiled,
@@ -107,6 +114,29 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
         floating,
         _contacts(robot, compiled),
     )
+
+
+def _check_limits(robot: RobotDescription, model: mujoco.MjModel) -> None:
+    """Refuse hinges whose limits in robot.toml are in another unit than the MJCF."""
+    for joint in robot.joints:
+        compiled = model.joint(joint.name)
+        if compiled.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
+            continue
+        (low, high), limited = compiled.range, model.jnt_limited[compiled.id]
+        largest = BEYOND * max(abs(low), abs(high)) + MARGIN if limited else TURNS
+        if max(abs(joint.lower), abs(joint.upper)) <= largest:
+            continue
+        told = f"{robot.folder / 'robot.toml'}: joint {joint.name!r}: "
+        told += f"[{joint.lower:g}, {joint.upper:g}] "
+        if not limited:
+            raise InputError(
+                f"{told}is more than two turns; are these degrees? If not, give the joint a range "
+                "in model.xml"
+            )
+        raise InputError(
+            f"{told}is far beyond its range [{low:.3g}, {high:.3g}] rad in model.xml; is one of "
+            'them in degrees? model.xml is, unless it has <compiler angle="radian"/>'
+        )
 
 
 def joint_inertia(model: Model, armature: Array | None, shape: tuple[int, ...]) -> Array:

@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
+from pup.physics.model import compile_model
 from pup.robot import RobotDescription
 
 REFERENCE_TORQUE = 2.5
@@ -45,7 +47,9 @@ class Scale:
         """The scale of a robot: a slide's ranges are in m, forces in N."""
         limits = [p.nominal for p in robot.parameters if p.name.startswith("tau_max/")]
         torque = float(np.median(limits)) / REFERENCE_TORQUE if limits else 1.0
-        slides = any(p.unit == "N" for p in robot.parameters if p.name.startswith("tau_max/"))
+        model = compile_model(robot, "suspended" if robot.floating else "bench").compiled
+        kinds = [model.joint(name).type[0] for name in robot.joint_names]
+        slides = mujoco.mjtJoint.mjJNT_SLIDE in kinds
         ranges = [joint.upper - joint.lower for joint in robot.joints]
         return cls(torque, float(np.median(ranges)) / REFERENCE_RANGE if slides else 1.0)
 
