@@ -3,7 +3,10 @@
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from pup.diagnosis.fitting import Fit, fit_together
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.fitting import Fit, fit_together, start_best
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.selection import MARGIN, ROUGH, Selector
@@ -11,10 +14,14 @@ from pup.diagnosis.starts import Tried, closely, joined, less
 from pup.diagnosis.verdict import probabilities
 from pup.physics.terms import Place
 
+Array = NDArray[np.float64]
+
 SWAPS, RIVALS = 2, 2
 """Effects that may be exchanged, and rivals that each may be exchanged for."""
 ASKED, LIKELY = 4, 0.01
 """Rivals of an effect that are looked at again beside all others, if they are so likely."""
+NEAR = 0.1
+"""Share of what the effect explains by which a rival may be behind to be fitted to its end."""
 
 
 class Exchanger(Selector):
@@ -138,9 +145,11 @@ class Exchanger(Selector):
         if not tried:
             return None
         fits = [f for _, f in tried]
+        places = [_places(f, found) for f, (_, found) in zip(fits, rivals, strict=True)]
+        start_best(fits, places, self.replays, self.noise)
         fit_together([fit, *fits], self.replays, self.noise, iterations=ROUGH)
-        least = 1.02 * model.fit.chi2 + MARGIN
-        closely([f for f in fits if f.chi2 < least], self.replays, self.noise)
+        near = model.fit.chi2 + MARGIN + NEAR * (fit.chi2 - model.fit.chi2)
+        closely([f for f in fits if f.chi2 < near], self.replays, self.noise)
         before = self.model(others, fit) if others else self.nominal
         holds, rest = self.parted(before, self.models(tried))
         known_as = replace(self.ended(model), hypotheses=(*others, hypothesis))
@@ -157,6 +166,15 @@ class Exchanger(Selector):
         likely = [m for chance, m in ranked if chance > LIKELY]
         rivals = [(m.hypotheses[-1], m.fit) for m in likely]
         return [(h, fit) for h, fit in rivals if h.key not in known][:ASKED]
+
+
+def _places(fit: Fit, found: Fit) -> list[Array]:
+    """Where a rival may start: at nominal parameters of the model, or as they were with it."""
+    own = dict(zip(found.names, found.at, strict=True))
+    nominal = [
+        own.get(n, at) if "@" not in n else at for n, at in zip(fit.names, fit.at, strict=True)
+    ]
+    return [fit.at, np.array(nominal)]
 
 
 def _chose(chosen: Round, hypothesis: Hypothesis) -> bool:
