@@ -1,7 +1,7 @@
 """What a robot is: a folder with `robot.toml` and `model.xml`, read strictly."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.files import sha256
 from pup.robot_mjcf import read_mjcf
 from pup.robot_parts import (
     Actuator,
@@ -78,7 +79,7 @@ class RobotDescription:
       network: options of the NN-PD actuator; None where it is not offered.
       actuator: the torque law to use when none is asked for.
       timestep: physics step, s.
-      digest: SHA-256 over robot.toml, model.xml and its includes.
+      digest: SHA-256 over robot.toml, model.xml, its includes and its assets.
     """
 
     name: str
@@ -137,7 +138,7 @@ class RobotDescription:
             network=network,
             actuator=read_actuator(table, network),
             timestep=read_timestep(table),
-            digest=_digest((text, *model.texts)),
+            digest=_digest((text, *model.texts), folder, sorted(model.assets)),
         )
         table.close()
         return robot
@@ -221,11 +222,13 @@ def built_in_robots() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in BUILT_IN.glob("*/robot.toml")))
 
 
-def _digest(texts: tuple[str, ...]) -> str:
-    """SHA-256 over the texts a robot is made of."""
+def _digest(texts: Sequence[str], folder: Path, assets: Sequence[Path]) -> str:
+    """SHA-256 over the texts and the assets that a robot is made of."""
     digest = hashlib.sha256()
     for text in texts:
         digest.update(hashlib.sha256(text.encode()).digest())
+    for asset in assets:
+        digest.update(f"{asset.as_posix()} {sha256(folder / asset)}".encode())
     return digest.hexdigest()
 
 

@@ -25,6 +25,7 @@ class MjcfNames:
       floating: the body that carries the free joint; None for a fixed base.
       texts: the XML files read, the model first, then its includes.
       files: the includes and assets that are there, relative to the model's folder.
+      assets: those of them that are no includes: meshes, textures and the like.
     """
 
     joints: tuple[str, ...]
@@ -34,6 +35,7 @@ class MjcfNames:
     floating: str | None
     texts: tuple[str, ...]
     files: frozenset[Path]
+    assets: frozenset[Path]
 
 
 def read_mjcf(path: Path) -> MjcfNames:
@@ -45,7 +47,8 @@ def read_mjcf(path: Path) -> MjcfNames:
     """
     texts: list[str] = []
     root = _parse(path, texts)
-    files = {*_splice_includes(root, path, texts), *_assets(root, path)}
+    includes = _splice_includes(root, path, texts)
+    assets = frozenset(_assets(root, path)) - includes
     joints: list[str] = []
     floating: list[str] = []
     names: dict[str, set[str]] = {"body": set(), "geom": set(), "site": set()}
@@ -74,7 +77,8 @@ def read_mjcf(path: Path) -> MjcfNames:
         sites=frozenset(names["site"]),
         floating=floating[0] if floating else None,
         texts=tuple(texts),
-        files=frozenset(files),
+        files=assets | includes,
+        assets=assets,
     )
 
 

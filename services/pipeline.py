@@ -159,9 +159,10 @@ class _Job:
                 recordings, threads = self.recordings, means.threads
                 identify(half.robot, recordings, half.options, folder, fits, progress, threads)
 
-        files = (half.at(BOUNDS), half.at("presysid/report.html"))
+        pictures = (half.at("presysid/report.html"),)
         inputs = self._measured(half) | _told(half.options.told())
-        return Stage(half.stage("presysid"), inputs, files, work)
+        files = (half.at(BOUNDS),)
+        return Stage(half.stage("presysid"), inputs, files, work, pictures=pictures)
 
     def _replay(self, half: Half) -> Stage:
         def work() -> None:
@@ -174,6 +175,7 @@ class _Job:
     def _train(self, half: Half) -> Stage | None:
         if not self.steps:
             return None
+        from services.curve import draw_curve
         from services.training import train
         from services.training_options import PATTERN, usual_learning
         from services.training_options import Options as Training
@@ -193,12 +195,17 @@ class _Job:
                 bounds, out = self.out / half.at(BOUNDS), self.out / half.at("train")
                 train(half.robot, bounds, options, out, self.means.ray, told, said)
 
+        curve, document = half.at("train/curve.png"), half.at("train/training.json")
+
+        def draw() -> None:
+            draw_curve(self.out / curve, content(self.out, document))
+
         begun = {} if start is None else {"policy that it starts from": sha256(start / CARD)}
         inputs = _described(half) | self._hash(half.at(BOUNDS)) | begun
         inputs |= _told(asdict(replace(options, start=None)))
         bundle = [half.at(f"{POLICY}/{name}") for name in (CARD, WEIGHTS, GRAPH)]
-        files = (half.at("train/training.json"), *bundle, half.at("train/curve.png"))
-        return self._alone(half, "train", inputs, files, work, remade=True)
+        stage = self._alone(half, "train", inputs, (document, *bundle), work)
+        return replace(stage, remade=True, pictures=(curve,), draw=draw)
 
     def _walk(self, half: Half) -> Stage | None:
         if not self.steps:
@@ -213,8 +220,9 @@ class _Job:
 
         inputs = _described(half) | self._hash(half.at(BOUNDS), half.at(f"{POLICY}/{CARD}"))
         inputs |= {"seed": str(shown.seed)}
-        names = "replay.json", "gait.png", "walk.mp4", "walk.gif"
-        return self._alone(half, "walk", inputs, [half.at(f"walk/{n}") for n in names], work)
+        stage = self._alone(half, "walk", inputs, [half.at("walk/replay.json")], work)
+        pictures = [half.at(f"walk/{name}") for name in ("gait.png", "walk.mp4", "walk.gif")]
+        return replace(stage, pictures=tuple(pictures), draw=work)
 
     def _transfer(self, half: Half) -> Stage | None:
         if not self.trials or (half.name and not self.steps):  # the same policy would walk again
@@ -255,8 +263,8 @@ class _Job:
 
         inputs = _described(half) | self._hash(half.at(BOUNDS), study)
         inputs |= {"policy": sha256(policy / CARD), "seed": str(seed)}
-        files = [half.at(f"rehearsal/{name}") for name in (FILE, PICTURE)]
-        return self._alone(half, "rehearsal", inputs, files, work)
+        stage = self._alone(half, "rehearsal", inputs, [half.at(f"rehearsal/{FILE}")], work)
+        return replace(stage, pictures=(half.at(f"rehearsal/{PICTURE}"),))
 
     def _diagnosis(self) -> Stage:
         from services.diagnosis import DIAGNOSIS as TOLD
@@ -269,10 +277,11 @@ class _Job:
             with self.means.replays() as where, self.means.looked() as looked:
                 run_diagnosis(self.robot, recordings, out, where, looked, seed, effects=effects)
 
-        files = [f"{DIAGNOSIS}/{n}" for n in (TOLD, "report.html", f"{CORRECTED}/robot.toml")]
+        files = [f"{DIAGNOSIS}/{name}" for name in (TOLD, f"{CORRECTED}/robot.toml")]
         inputs = self._measured(self.first) | {f"recording {r.id}": r.digest for r in walks}
         inputs |= {"seed": str(seed), "effects": str(effects)}
-        return Stage(DIAGNOSIS, inputs, tuple(files), work, DIAGNOSIS)
+        stage = Stage(DIAGNOSIS, inputs, tuple(files), work, DIAGNOSIS)
+        return replace(stage, pictures=(f"{DIAGNOSIS}/report.html",))
 
     def _walks(self) -> list[Recording]:
         """How the first walks of the trials began, by names that outlive an interruption."""
@@ -291,10 +300,9 @@ class _Job:
         inputs: Mapping[str, str],
         files: Sequence[str],
         work: Callable[[], None],
-        remade: bool = False,
     ) -> Stage:
         """A stage that has a folder to itself."""
-        return Stage(half.stage(name), inputs, tuple(files), work, half.at(name), remade)
+        return Stage(half.stage(name), inputs, tuple(files), work, half.at(name))
 
     def _report(self, documents: Mapping[str, Any]) -> Stage:
         from services.job_report import Job, write_report

@@ -3,6 +3,7 @@
 import hashlib
 import platform
 import subprocess
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -14,22 +15,27 @@ PACKAGE = Path(pup.__file__).parent
 PACKAGES = ("pup", "mujoco", "numpy", "scipy")
 NOT_THE_ENGINE = "blind"
 """What makes sets and scores verdicts has no part in them."""
+ALSO = ("hardware_agent", "services", "workers")
+"""Packages besides that decide what is trained and what a robot does in trials."""
 SUFFIXES = (".py", ".toml", ".xml", ".json")
 GIT_SECONDS = 20
 
 
-def engine() -> dict[str, Any]:
-    """What diagnoses, as JSON values.
+def engine(also: Sequence[str] = ()) -> dict[str, Any]:
+    """What diagnoses, as JSON values; or what trains and walks.
+
+    Args:
+      also: packages beside this one whose files count, such as `ALSO`.
 
     Returns:
       The commit `git_sha` and whether files are not those of it, `dirty`, both None outside of a
-      checkout; `source_sha256` of the package's files; `versions`.
+      checkout; `source_sha256` of the packages' files; `versions`.
     """
-    sha, dirty = _checkout()
+    sha, dirty = _checkout(also)
     return {
         "git_sha": sha,
         "dirty": dirty,
-        "source_sha256": _digest(),
+        "source_sha256": _digest(also),
         "versions": versions(*PACKAGES),
     }
 
@@ -44,23 +50,26 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _digest() -> str:
-    digest = hashlib.sha256()
-    for file in sorted(PACKAGE.rglob("*")):
-        name = file.relative_to(PACKAGE)
+def _digest(also: Sequence[str]) -> str:
+    digest, beside = hashlib.sha256(), PACKAGE.parent
+    files = [(file, file.relative_to(PACKAGE)) for file in sorted(PACKAGE.rglob("*"))]
+    for package in also:
+        files += [(f, f.relative_to(beside)) for f in sorted((beside / package).rglob("*"))]
+    for file, name in files:
         if file.suffix in SUFFIXES and file.is_file() and name.parts[0] != NOT_THE_ENGINE:
             digest.update(name.as_posix().encode())
             digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
 
-def _checkout() -> tuple[str | None, bool | None]:
-    """The commit that the package is of, and whether its files differ from it."""
+def _checkout(also: Sequence[str]) -> tuple[str | None, bool | None]:
+    """The commit that the packages are of, and whether their files differ from it."""
     # Asked for first: an installed package may lie below a checkout of something else.
     if not _git("ls-files", "--", "__init__.py"):
         return None, None
     sha = _git("rev-parse", "HEAD")
-    changed = _git("status", "--porcelain", "--", ".", f":!{NOT_THE_ENGINE}")
+    folders = (".", *(f"../{package}" for package in also))
+    changed = _git("status", "--porcelain", "--", *folders, f":!{NOT_THE_ENGINE}")
     return (sha, bool(changed)) if sha else (None, None)
 
 

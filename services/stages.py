@@ -3,7 +3,7 @@
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ class Stage:
       folder: that belongs to it alone, and is emptied before it is done with other inputs; empty
         for a step that sees to that itself.
       remade: whether it is also emptied where one of its files was changed.
+      pictures: and reports that it may leave besides; without them it is done all the same.
+      draw: makes pictures again where some are gone; None leaves it at that.
     """
 
     name: str
@@ -35,6 +37,8 @@ class Stage:
     work: Callable[[], object]
     folder: str = ""
     remade: bool = False
+    pictures: tuple[str, ...] = ()
+    draw: Callable[[], object] | None = None
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Done:
     Attributes:
       inputs: see Stage.
       seconds: that it took, since it was last interrupted.
-      files: SHA-256 of those of its files that there are.
+      files: SHA-256 of those of its files and pictures that there are.
     """
 
     inputs: Mapping[str, str]
@@ -73,6 +77,9 @@ class Journal:
     def once(self, stage: Stage) -> None:
         """Do a step, unless it is done from the same inputs and its files are as it left them."""
         if self.kept(stage):
+            drawn = self._left(stage, stage.pictures)
+            if stage.draw is not None and self._files(drawn).keys() != drawn.keys():
+                stage.draw()
             return
         inputs = dict(stage.inputs)
         same = self._entry(stage).get("inputs") == inputs
@@ -83,7 +90,8 @@ class Journal:
         begin = time.time()
         stage.work()
         seconds = round(time.time() - begin, 1)
-        done = {"inputs": inputs, "seconds": seconds, "files": self._files(stage)}
+        files = self._files((*stage.files, *stage.pictures))
+        done = {"inputs": inputs, "seconds": seconds, "files": files}
         self._write("stages", stage, done)
 
     def _write(self, part: str, stage: Stage, told: dict[str, Any]) -> None:
@@ -93,20 +101,25 @@ class Journal:
 
     def kept(self, stage: Stage) -> bool:
         """Whether a step is done from the same inputs and its files are as it left them."""
-        entry = self._entry(stage)
-        same = entry.get("inputs") == dict(stage.inputs)
-        return same and entry.get("files") == self._files(stage)
+        same = self._entry(stage).get("inputs") == dict(stage.inputs)
+        return same and self._left(stage, stage.files) == self._files(stage.files)
 
     def _entry(self, stage: Stage) -> dict[str, Any]:
         entry = self._told["stages"].get(stage.name)
         return entry if isinstance(entry, dict) else {}
 
+    def _left(self, stage: Stage, names: Sequence[str]) -> dict[str, str]:
+        """SHA-256 of those of these files that the step left."""
+        left = self._entry(stage).get("files", {})
+        return {name: digest for name, digest in left.items() if name in names}
+
     def done(self, name: str) -> Done:
         """What is told of a step that is done."""
         return Done(**self._told["stages"][name])
 
-    def _files(self, stage: Stage) -> dict[str, str]:
-        there = [name for name in stage.files if (self.out / name).is_file()]
+    def _files(self, names: Iterable[str]) -> dict[str, str]:
+        """SHA-256 of those files that there are."""
+        there = [name for name in names if (self.out / name).is_file()]
         return {name: sha256(self.out / name) for name in there}
 
 

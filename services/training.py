@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
@@ -21,16 +22,17 @@ from pup.locomotion.settings import TaskSettings
 from pup.locomotion.task import WalkingTask
 from pup.physics.engine import Engine
 from pup.policy.bundle import CARD, NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
-from pup.policy.mirror import MirrorMap
+from pup.policy.mirror import MirrorMap, unmirrored
 from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import RobotDescription
 from pup.sysid.problem import MODEL
 from pup.sysid.result import read_bounds
+from services import stopping
 from services.checkpoint import Checkpoint
 from services.curve import draw_curve
 from services.first_gait import FirstGait, Said, read_gait
-from services.provenance import engine, now
+from services.provenance import ALSO, engine, now
 from services.tracking import Trackers
 from services.training_options import Options
 from workers.ppo import Iteration, Setup, Trainer
@@ -43,6 +45,9 @@ ROBOTS_A_THREAD = 64
 on 16 threads and 8,100 on 4 (docs/results/training.md)."""
 GAIT_THREADS = 4
 """Of the few robots that a first gait is searched on."""
+MOST_EMPTY, EMPTY_SECONDS = 12, 5.0
+"""Iterations in a row for which no runner has sampled, and how long each is waited for: a runner
+takes half a minute to start on a busy machine."""
 SMOOTHED = 10
 """Iterations whose mean return says which weights were best so far."""
 ETAS = 20_000
@@ -166,16 +171,28 @@ class _Job:
 
     def _iterate(self, trainer: Trainer) -> dict[str, Any]:
         begin = time.monotonic()
-        told = trainer.iterate()
-        while not told.steps:  # all runners are lost; they start again
-            self.lost += told.lost
-            told = trainer.iterate()
-        self.lost += told.lost
+        told = self._sampled(trainer)
         self.seconds += time.monotonic() - begin
         row = _row(told, self.rows[-1]["steps"] if self.rows else 0, self.seconds)
         self.rows.append(row)
         self.told(row, self.options.steps)
         return row
+
+    def _sampled(self, trainer: Trainer) -> Iteration:
+        """An iteration that learnt something; runners that are all lost are waited for.
+
+        Raises:
+          ConnectionError: they do not come back.
+        """
+        for turn in range(MOST_EMPTY):
+            if turn:
+                stopping.check()
+                time.sleep(EMPTY_SECONDS)
+            told = trainer.iterate()
+            self.lost += told.lost
+            if told.steps:
+                return told
+        raise ConnectionError("all runners were lost and none came back; the same command resumes")
 
     def _write(self, trainer: Trainer, best: Weights | None) -> None:
         """A checkpoint; after the best policy so far, which it does not hold."""
@@ -201,7 +218,7 @@ class _Job:
             "steps": steps,
             "seconds": round(self.seconds, 1),
             "terms": [asdict(term) for term in self.robot.terms],
-            "engine": engine(),
+            "engine": engine(ALSO),
             "written": now(),
         }
         mu = np.random.default_rng(0).uniform(-MARGIN, 1 + MARGIN, (ETAS, len(self.bounds.names)))
@@ -232,6 +249,10 @@ class _Job:
     def _mirror(self, task: WalkingTask) -> MirrorMap | None:
         wanted = self.options.learning.weights.mirror and self.options.direction.symmetric
         if not wanted or not self.robot.mirrored:
+            return None
+        if self.shape.eta and (lost := unmirrored(self.robot, task.parameter_names)):
+            line = f"mirror loss left out: the bounds hold no mirror image of {', '.join(lost)}"
+            print(line, file=sys.stderr, flush=True)
             return None
         names = task.observation_names, task.parameter_names
         return MirrorMap.of(self.robot, *names, bins=task.bins)
@@ -337,7 +358,7 @@ class _Job:
                 "bounds_sha256": self.bounds_sha256,
                 "robot_digest": self.robot.digest,
                 "terms": [asdict(term) for term in self.robot.terms],
-                "engine": engine(),
+                "engine": engine(ALSO),
             },
         }
 

@@ -48,6 +48,14 @@ REFUSED = {
     "schema = 1\n[diagnosis]\neffects = 0": "diagnosis: effects must be 1 or more",
     "schema = 1\npooled = true": "pooled: needs fixed_network in presysid",
     "schema = 1\nseeds = [1]\npooled = true\n[presysid]\nfixed_network = true": "and two robots",
+    "schema = 1\nseeds = [1, 2.5]": "seeds: 2.5 is no whole number",
+    "schema = 1\n[presysid]\npopulation = 0": "presysid: population must be 4 or more",
+    "schema = 1\n[presysid]\ngenerations = 0": "presysid: generations must be 1 or more",
+    "schema = 1\n[fleet]\nsubsets = 0": "fleet: subsets must be 1 or more",
+    "schema = 1\n[fleet]\nfraction = 1.5": "fleet: fraction must be above 0, and 1 at most",
+    "schema = 1\n[fleet]\nfraction = 0": "fleet: fraction must be above 0, and 1 at most",
+    "schema = 1\n[trials]\nhorizon = -1": "trials: horizon, and seconds of diagnosis",
+    "schema = 1\n[train]\nfleet = '--see 3'": "unrecognized arguments: --see 3",
     "schema = 1\n[record]\nmotions = []": "a motion and a repeat at least",
     "seeds": "not a TOML document",
 }
@@ -192,6 +200,35 @@ def test_seeds_are_counted_before_they_are_made(
     with pytest.raises(SystemExit):
         parser().parse_args(["experiment", "--small", "--seeds", told, "--out", "x"])
     assert time.monotonic() - begun < 5 and "--seeds" in capsys.readouterr().err
+
+
+IN_VAIN: dict[str, tuple[dict[str, object], str]] = {
+    "unknown": ({"motions": ("step", "jump:2")}, "record: motions: 'jump' is none of step, "),
+    "no type": ({"fitted": ("step:0.3",)}, "record: fitted: 'step:0.3' is none of step, "),
+    "not played": ({"fitted": ("fall",)}, "record: no motion is of a type in fitted"),
+}
+
+
+@pytest.mark.parametrize("name", IN_VAIN)
+def test_motions_that_would_be_looked_for_in_vain_are_refused(name: str) -> None:
+    changes, words = IN_VAIN[name]
+    with pytest.raises(InputError, match=words):
+        graph(replace(small(), record=replace(small().record, **changes)))
+
+
+def test_what_is_diagnosed_tells_of_what_is_fitted_where_robots_are_corrected() -> None:
+    def of(*motions: str) -> Plan:
+        return replace(small(), diagnosis=replace(small().diagnosis, motions=motions))
+
+    with pytest.raises(InputError, match="shares no type with fitted of record"):
+        graph(of("standup"))
+    assert graph(replace(of("standup"), stages=("diagnosis", "trials")))
+    with pytest.raises(InputError, match="diagnosis: no motion of record"):
+        graph(of("fall"))
+    with pytest.raises(InputError, match="diagnosis: motions: 'walk' is none of step"):
+        graph(of("walk"))
+    recorded = replace(of().record, motions=("hold",))
+    assert graph(replace(of(), record=recorded, stages=("diagnosis",)))
 
 
 def test_words_of_a_training() -> None:

@@ -1,6 +1,7 @@
 """Cells are done once, go on where they were, and two runs agree; and what is made of them."""
 
 import json
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,13 +20,13 @@ from pup.files import write_json
 from pup.policy.bundle import NumpyPolicy
 from pup.policy.shape import Method
 from pup.robot import RobotDescription
-from services import places
+from services import places, provenance
 from services.experiment import work
 from services.experiment.cells import Cell, graph
 from services.experiment.gather import gather
 from services.experiment.plan import Plan, small
 from services.experiment.report import estimated, write_report
-from services.experiment.run import CELLS, FILES, run_again, run_cells
+from services.experiment.run import CELLS, FILES, Outcome, failure, run_again, run_cells
 from services.experiment.walking import conditioned
 
 ROBOT = RobotDescription.load("darwin_op2")
@@ -42,6 +43,7 @@ class Workshop:
         self.done: list[str] = []
         self.stops: set[str] = set()
         self.fails: set[str] = set()
+        self.breaks: set[str] = set()
         self.chance: float = 0.0
 
     def work(self, task: work.Task) -> dict[str, Any]:
@@ -51,6 +53,8 @@ class Workshop:
             raise KeyboardInterrupt
         if name in self.fails:
             raise InputError("it cannot be done")
+        if name in self.breaks:
+            raise RuntimeError("the disk is full")
         self.done.append(name)
         for left in work.LEFT.get(task.cell.kind, ()):
             write_json(task.out / left, {})
@@ -64,7 +68,7 @@ def workshop(monkeypatch: pytest.MonkeyPatch) -> Workshop:
     return shop
 
 
-def do(cells: dict[str, Cell], out: Path) -> dict[str, str]:
+def do(cells: dict[str, Cell], out: Path) -> dict[str, Outcome]:
     return run_cells(cells, out, places.OneByOne, told)
 
 
@@ -166,14 +170,41 @@ def test_what_fails_is_told_and_tried_again_and_all_else_is_done(
     behind = {n for n in cells if "r1001" in n and "corrected" in n}
     behind |= {n for n in cells if n.endswith("-diagnosed")}  # of all robots
     assert set(failed) == {"diagnosis-r1001"} | behind
-    assert failed["diagnosis-r1001"] == "InputError: it cannot be done"
-    assert failed["presysid-r1001-corrected"] == "needs diagnosis-r1001"
+    assert failed["diagnosis-r1001"].error == "InputError: it cannot be done"
+    assert failed["presysid-r1001-corrected"].error == "needs diagnosis-r1001"
     error = json.loads((tmp_path / CELLS / "diagnosis-r1001" / "error.json").read_text())
     assert "Traceback" in error["details"][0]
     workshop.fails = set()
     assert do(cells, tmp_path) == {}
     assert not (tmp_path / CELLS / "diagnosis-r1001" / "error.json").exists()
     assert sorted(workshop.done) == sorted(cells)
+
+
+def test_only_where_all_that_failed_was_bad_input_it_is_told_as_such(
+    workshop: Workshop, tmp_path: Path
+) -> None:
+    """A job whose exit code says so is not tried again; one whose node was lost has to be."""
+    options = ("experiment", "--small", "--stages", "record", "--local", "--out", tmp_path)
+    workshop.fails = {"record-r1000", "record-r1001"}
+    refused = pup(*options)
+    assert refused.code == 2 and "2 cells failed" in refused.err
+    workshop.fails, workshop.breaks = {"record-r1001"}, {"record-r1000"}
+    broken = pup(*options)
+    assert broken.code == 1 and "2 cells failed" in broken.err
+    assert broken.err.splitlines()[-1].startswith("pup experiment: ")
+    again = pup(*options, "--cell", "record-r1000")
+    assert again.code == 1 and "Traceback" not in again.err
+
+
+def test_a_cell_whose_process_was_lost_is_no_bad_input(workshop: Workshop, tmp_path: Path) -> None:
+    class Lost(places.OneByOne):
+        def settled(self) -> tuple[Any, Any]:
+            return self.waiting.popleft(), RuntimeError("the node died")
+
+    cells = graph(small())
+    failed = run_cells(cells, tmp_path, Lost, told)
+    assert failed["record-r1000"].error == "RuntimeError: the node died"
+    assert isinstance(failure(failed, tmp_path), ChildProcessError)
 
 
 def test_a_cell_is_done_again_beside_what_it_left(workshop: Workshop, tmp_path: Path) -> None:
@@ -192,6 +223,27 @@ def test_a_cell_is_done_again_beside_what_it_left(workshop: Workshop, tmp_path: 
     assert do(cells, tmp_path) == {}
     with pytest.raises(InputError, match="there is none"):
         run_again(cells, "walk", tmp_path, places.OneByOne, told)
+
+
+def test_all_recordings_of_a_real_robot_are_identified(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Found:
+        def document(self) -> dict[str, Any]:
+            names = ("parameters", "actuator", "loss", "histories", "splits")
+            return dict.fromkeys(names, 1)
+
+    given: list[int] = []
+
+    def identify(robot: RobotDescription, recordings: Any, *_: Any) -> Found:
+        given.append(len(recordings))
+        return Found()
+
+    monkeypatch.setattr("services.presysid.identify", identify)
+    real = ROBOT.folder / "recordings"
+    cell = graph(small(), real=real)["presysid-real"]
+    assert work.KINDS["presysid"](work.Task(cell, tmp_path, {}))["loss"] == 1
+    assert given == [len([*real.glob("*.parquet")])]
 
 
 def needed(cells: dict[str, Cell], name: str) -> Iterator[str]:
@@ -275,6 +327,25 @@ def test_a_policy_without_eta_acts_the_same_whatever_a_study_tells_it(tmp_path: 
         assert np.array_equal(before.act(seen, np.zeros(0)), after.act(seen, np.array([eta])))
     pup_ = agents.bundle(tmp_path / "pup")
     assert conditioned(pup_, tmp_path / "nowhere", ROBOT) == pup_
+
+
+def test_all_that_decides_counts_as_source_of_an_experiment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a diagnosis the package alone does."""
+    for package in ("pup", "services"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+    commit = ("-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "--message", "a")
+    for words in (("init", "--quiet"), ("add", "."), commit):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path / "pup")
+    alone, whole = provenance.engine(), provenance.engine(provenance.ALSO)
+    assert alone["git_sha"] and not alone["dirty"] and not whole["dirty"]
+    (tmp_path / "services" / "walk.py").touch()
+    assert provenance.engine() == alone
+    changed = provenance.engine(provenance.ALSO)
+    assert changed["dirty"] and changed["source_sha256"] != whole["source_sha256"]
 
 
 REFUSED = {

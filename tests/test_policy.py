@@ -19,6 +19,7 @@ from pup.policy.losses import (  # noqa: E402
     advantages,
     losses,
 )
+from pup.policy.mirror import MirrorMap, unmirrored  # noqa: E402
 from pup.policy.network import Normaliser, ProjectedPolicy, draw  # noqa: E402
 from pup.policy.shape import PolicyShape  # noqa: E402
 
@@ -125,6 +126,29 @@ def test_mirror_of_a_pose() -> None:
     told = MIRROR.signs * seen[MIRROR.entries]
     assert told[OBSERVATION.index("position/r_knee")] == -OBSERVATION.index("position/l_knee")
     assert told[-4:].tolist() == [-40.0, 41.0, -42.0, 43.0]
+
+
+def test_parameters_are_mirrored_with_the_joints_that_they_are_of() -> None:
+    """And what has no mirror image in mu is told."""
+    knees = tuple(f"backlash/gap@joint:{side}_knee" for side in "rl")
+    alone = (
+        *("rho/knee", "torque_limit", "torso_com/x", "torso_com/z", "ground_friction"),
+        *("coulomb_friction/torque@group:ankle", "command_delay/time@bus", "imu_delay/time@sensor"),
+        *("ground_slope/pitch@ground", "payload/mass@body:body", "clock_skew/share@robot"),
+        "backlash/gap@joint:head_pan",
+    )
+    names = (*knees, *alone)
+    mirror = MirrorMap.of(ROBOT, OBSERVATION, names)
+    assert mirror.parameters.tolist() == [1, 0, *range(2, len(names))]
+    assert unmirrored(ROBOT, names) == ()
+    lateral = (
+        *("torso_com/y", "ground_slope/roll@ground", "com_offset/y@body:body"),
+        *("backlash/gap@joint:l_ank_roll", "payload/mass@body:l_knee_link"),
+        *("imu_misalignment/yaw@sensor", "encoder_bias/offset@joint:head_pan"),
+        *("ground_compliance/time@foot:l_ank_roll_link", "cogging/sine@group:knee"),
+    )
+    assert unmirrored(ROBOT, (*names, *lateral)) == lateral
+    assert unmirrored(ROBOT, knees[:1]) == knees[:1]
 
 
 def test_mirrored_bins_are_the_likeliest_of_mirrored_logits() -> None:

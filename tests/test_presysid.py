@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from pup.sysid.fit import FitResult
+from pup.sysid.result import Bounds
+from services import presysid
 from services.presysid import _Job
 from services.presysid_options import Options
 from workers.fits import Fit, Progress
@@ -139,6 +142,31 @@ def test_what_was_not_diagnosed_is_fitted_and_the_rest_stays(
     bounds = job.run()
     assert "others" not in runner.fits
     assert (bounds.ci90[:, 0] == bounds.ci90[:, 1]).all() and bounds.identified.all()
+
+
+def test_bounds_that_are_made_again_are_the_same_file(
+    robot: RobotDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others know them by its SHA-256, and how long it took is no part of them."""
+    clock = iter(range(0, 1000, 7))
+    monkeypatch.setattr(presysid, "time", SimpleNamespace(time=lambda: next(clock) ** 2))
+    monkeypatch.setattr(presysid, "write_report", lambda *_: None)
+    recordings = (stepped("a", "suspended"), stepped("b", "ground"))
+    file = tmp_path / "bounds.json"
+
+    def made(seed: int) -> tuple[bytes, Bounds]:
+        options = Options("pd", subsets=2, compare=False, seed=seed)
+        bounds = job_of(robot, recordings, tmp_path, options)[0].run()
+        return file.read_bytes(), bounds
+
+    first, bounds = made(seed=0)
+    again, same = made(seed=0)
+    assert again == first and same.provenance == bounds.provenance
+    other, bounds = made(seed=1)
+    assert other != first and bounds.provenance["seconds"] != same.provenance["seconds"]
+    for spoilt in ("[]", "{}", '{"provenance": 1}', "{"):
+        file.write_text(spoilt)
+        assert presysid._as_before(bounds, file) is bounds
 
 
 class Moved(Idle):

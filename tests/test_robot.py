@@ -1,5 +1,6 @@
 """Robot folders: what is read, and what is refused with which words."""
 
+import hashlib
 import re
 import shutil
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pup.errors import InputError
+from pup.physics.model import compile_model
 from pup.robot import RobotDescription, built_in_robots
 
 MODEL = """
@@ -141,6 +143,22 @@ def test_the_digest_follows_every_file_of_the_model(tmp_path: Path) -> None:
     third = RobotDescription.load(folder)
     assert len({first.digest, second.digest, third.digest}) == 3
     assert re.fullmatch(r"[0-9a-f]{64}", first.digest)
+
+
+def test_the_digest_follows_meshes_by_name_and_content(tmp_path: Path) -> None:
+    """Without any it is what it always was, so that what was made with it stays good."""
+    told = robot_folder(tmp_path / "none")
+    texts = [(told / name).read_bytes() for name in ("robot.toml", "model.xml")]
+    parts = b"".join(hashlib.sha256(text).digest() for text in texts)
+    assert RobotDescription.load(told).digest == hashlib.sha256(parts).hexdigest()
+    asset = '<compiler meshdir="stl"/><asset><mesh name="m" file="a.stl"/></asset><worldbody>'
+    folder = robot_folder(tmp_path / "some", model=MODEL.replace("<worldbody>", asset))
+    digests = {RobotDescription.load(folder).digest}
+    for file, content in (("a.stl", "1"), ("a.stl", "2"), ("stl/a.stl", "2")):
+        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / file).write_text(content)
+        digests.add(RobotDescription.load(folder).digest)
+    assert len(digests) == 4
 
 
 @given(arrays(np.float64, (3, len(DARWIN.joints)), elements=st.floats(-4, 4)))
@@ -393,6 +411,15 @@ def test_files_that_are_too_large_or_not_text_are_refused(tmp_path: Path) -> Non
     (folder / "robot.toml").write_text(ROBOT)
     (folder / "model.xml").unlink()
     refused(folder, "model.xml: cannot be read")
+
+
+def test_the_mark_of_windows_notepad_is_no_mistake(tmp_path: Path) -> None:
+    folder = robot_folder(tmp_path)
+    plain = RobotDescription.load(folder)
+    for file in ("robot.toml", "model.xml"):
+        (folder / file).write_bytes(b"\xef\xbb\xbf" + (folder / file).read_bytes())
+    assert RobotDescription.load(folder) == plain
+    compile_model(plain, "ground")
 
 
 def test_no_such_robot_names_the_built_in_ones(tmp_path: Path) -> None:

@@ -73,6 +73,21 @@ def test_a_stage_is_done_once_and_again_when_something_changed(tmp_path: Path) -
     assert counter.count == 4 and kept(tmp_path) == ["attempt3"]
 
 
+def test_what_is_done_stays_done_without_its_pictures(tmp_path: Path) -> None:
+    """They are drawn again where that can be done alone, and only where there were some."""
+    counter, drawn = Counter(tmp_path), []
+    pictures = ("one/attempt1", "one/never.png")
+    stage = replace(counter.stage(), pictures=pictures, draw=lambda: drawn.append(1))
+    Journal(tmp_path).once(stage)
+    assert Journal(tmp_path).done("one").files.keys() == {"one/x.json", "one/attempt1"}
+    Journal(tmp_path).once(stage)
+    assert not drawn
+    (tmp_path / "one" / "attempt1").unlink()
+    Journal(tmp_path).once(stage)
+    Journal(tmp_path).once(replace(stage, draw=None))
+    assert counter.count == 1 and drawn == [1]
+
+
 def test_an_interrupted_stage_finds_what_it_left_unless_its_inputs_changed(tmp_path: Path) -> None:
     counter = Counter(tmp_path)
     counter.fails = True
@@ -161,6 +176,31 @@ def test_a_shipped_policy_is_started_from_where_there_is_one(
     shutil.rmtree(shipped)
     agents.bundle(shipped, parameters=names[1:])
     assert start() == shipped  # of other parameters: it learns to see them
+
+
+def test_no_picture_has_anything_done_again(tmp_path: Path) -> None:
+    """A removed curve would cost the training, whose folder is emptied before it is made again."""
+    from services.mission import Mission
+    from services.pipeline import _Job
+    from services.presysid_options import Options
+
+    (tmp_path / "presysid").mkdir()
+    shutil.copy(DARWIN.identified_path, tmp_path / "presysid" / "bounds.json")
+    (tmp_path / "train" / "policy").mkdir(parents=True)
+    (tmp_path / "train" / "policy" / "policy.json").write_text("{}")
+    (tmp_path / "transfer").mkdir()
+    (tmp_path / "transfer" / "study.json").write_text("{}")
+    job = _Job(DARWIN, (), Mission(Options(), 1000, 3), tmp_path, idle())
+    makers = (job._presysid, job._train, job._walk, job._transfer, job._rehearsal)
+    stages = [make(job.first) for make in makers]
+    for stage in stages:
+        assert {Path(file).suffix for file in stage.files} <= {".json", ".npz", ".onnx"}
+    assert stages[1].pictures == ("train/curve.png",)
+    curve = {name: [0.1] for name in ("steps", "distance", "time", "reward", "kl")}
+    told = {"robot": "r", "method": "pup", "direction": "forward", "steps": 9, "seconds": 9}
+    write_json(tmp_path / "train" / "training.json", told | {"curve": curve})
+    stages[1].draw()
+    assert (tmp_path / "train" / "curve.png").exists()
 
 
 def test_the_report_tells_what_each_stage_found_and_hashes(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from concurrent.futures import CancelledError
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,14 +28,15 @@ from pup.policy.bundle import NumpyPolicy
 from pup.policy.losses import LossWeights, Samples
 from pup.policy.network import ProjectedPolicy
 from pup.policy.shape import Method, PolicyShape
-from pup.robot import RobotDescription
+from pup.robot import RobotDescription, TermSpec
+from pup.robot_writer import write_corrected
 from services import training
 from services.arguments import parser
 from services.training_options import Options, training_options
 from workers.cluster import connected
 from workers.learner import FragmentsToBatch, Learning, merged, prepared, shuffled
 from workers.module import PolicyModule, load
-from workers.ppo import Setup, Trainer, learner_place
+from workers.ppo import Iteration, Setup, Trainer, learner_place
 from workers.rollouts import Sampler, Sampling, spaces
 
 SHAPE = PolicyShape.of(Method.PUP, 2, 2, 2, 2)
@@ -149,6 +151,36 @@ def test_epochs_are_shuffled_alike_by_seed() -> None:
     assert all(len(set(epoch)) == 768 for epoch in epochs)
     assert not np.array_equal(epochs[0], np.sort(epochs[0]))
     assert not np.array_equal(epochs[0], epochs[1])
+
+
+def test_a_runner_that_was_lost_leaves_the_others_their_states() -> None:
+    """Those that answered go on where they were; the lost one begins anew."""
+
+    def runner(index: int) -> SimpleNamespace:
+        return SimpleNamespace(worker_index=index, sampler=Sampler(SAMPLING, index))
+
+    def trainer(*runners: SimpleNamespace) -> Trainer:
+        made = Trainer.__new__(Trainer)
+        made.runners = 3
+        learner = SimpleNamespace(get=dict)
+        made.algorithm = SimpleNamespace(
+            settle=lambda: None,
+            coming=list,
+            learner_group=SimpleNamespace(foreach_learner=lambda action: [learner]),
+            env_runner_group=SimpleNamespace(
+                foreach_env_runner=lambda action, **_: [action(one) for one in runners]
+            ),
+        )
+        return made
+
+    first, last = runner(1), runner(3)
+    for one in (first, last, last):
+        one.sampler.sample(policy())
+    again = [runner(index) for index in (1, 2, 3)]
+    trainer(*again).restore(trainer(first, last).state())
+    assert [one.sampler.fragments for one in again] == [1, 0, 2]
+    for one, other in ((again[0], first), (again[2], last)):
+        np.testing.assert_array_equal(one.sampler.task.x, other.sampler.task.x)
 
 
 # --- On a real Ray --------------------------------------------------------------------------------
@@ -286,6 +318,54 @@ def job(out: Path, options: Options = SMALL, told=lambda row, steps: None):
 def weights_of(out: Path) -> dict[str, np.ndarray]:
     with np.load(out / "policy" / "weights.npz", allow_pickle=False) as packed:
         return {name: packed[name] for name in packed.files}
+
+
+def test_runners_that_do_not_come_back_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a while; before, one that comes back has the training go on."""
+    monkeypatch.setattr(training, "EMPTY_SECONDS", 0.0)
+    empty = Iteration(0, 32, np.empty((0, 4)), np.nan, (0.0, 0.0), {})
+    whole = replace(empty, steps=32, lost=0, reward=1.0)
+    told = [*[empty] * (training.MOST_EMPTY - 1), whole]
+    trainer = SimpleNamespace(iterate=lambda: told.pop(0) if told else empty)
+    one = training._Job(ROBOT, None, SMALL, tmp_path, lambda row, steps: None, lambda *_: None)
+    assert one._iterate(trainer)["steps"] == 32
+    assert one.lost == 32 * (training.MOST_EMPTY - 1)
+    with pytest.raises(ConnectionError, match="all runners were lost"):
+        one._iterate(trainer)
+
+    def stopped() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("services.stopping.check", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        one._iterate(trainer)
+
+
+@pytest.mark.parametrize("method", [Method.PUP, Method.ROBUST])
+def test_no_mirror_loss_where_mu_has_no_mirror_image(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], method: Method
+) -> None:
+    """Of a policy that sees mu: to another one it is all the same."""
+    term = TermSpec("backlash", "joint", "l_knee", {"gap": 0.02, "behind": 1.0})
+    robot = write_corrected(ROBOT, tmp_path / "corrected", {}, (term,), actuator="nn_pd")
+    told = json.loads(ROBOT.identified_path.read_text())
+    play = {"name": "backlash/gap@joint:l_knee", "nominal": 0.02, "lower": 0.01, "upper": 0.03}
+    told["parameters"].append(play)
+    bounds = tmp_path / "bounds.json"
+    bounds.write_text(json.dumps(told))
+
+    def mirrored(source: Path | None) -> bool:
+        options = replace(SMALL, method=method)
+        nobody = (lambda row, steps: None), (lambda words, share: None)
+        one = training._Job(robot, source, options, tmp_path, *nobody)
+        return one.learning.mirror is not None
+
+    assert mirrored(ROBOT.identified_path) and not capsys.readouterr().err
+    assert mirrored(bounds) == (method is Method.ROBUST)
+    line = "mirror loss left out: the bounds hold no mirror image of backlash/gap@joint:l_knee\n"
+    assert capsys.readouterr().err == ("" if method is Method.ROBUST else line)
 
 
 @pytest.mark.ray

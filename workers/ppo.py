@@ -299,8 +299,9 @@ class Trainer:
         told = {f"learner/{k}": v for k, v in self._learner().items()}
         for i, fragment in enumerate(self.algorithm.coming()):
             told |= {f"coming{i}/{f.name}": getattr(fragment, f.name) for f in fields(Fragment)}
-        for i, runner in enumerate(self.each_runner(lambda one: one.sampler.state())):
-            told |= {f"runner{i}/{k}": v for k, v in runner.items()}
+        # By their index: one that was lost, and does not answer, leaves the others in their places.
+        for place, runner in self.each_runner(lambda one: (_place(one), one.sampler.state())):
+            told |= {f"runner{place}/{k}": v for k, v in runner.items()}
         return told
 
     def restore(self, state: State) -> None:
@@ -311,7 +312,8 @@ class Trainer:
         states = [_below(state, f"runner{i}") for i in runners]
 
         def give(runner: BatchRunner) -> None:
-            runner.sampler.restore(states[max(0, runner.worker_index - 1)])
+            if told := states[_place(runner)]:  # else it was lost, and begins anew
+                runner.sampler.restore(told)
 
         self.each_runner(give)
         kept = [Fragment(**arrays) for i in runners if (arrays := _below(state, f"coming{i}"))]
@@ -332,6 +334,11 @@ class Trainer:
         self.algorithm.settle()
         group = self.algorithm.env_runner_group
         return list(group.foreach_env_runner(action, local_env_runner=not self.runners))
+
+
+def _place(runner: BatchRunner) -> int:
+    """Which of those that sample it is: RLlib counts remote ones from 1, and calls its own 0."""
+    return max(0, int(runner.worker_index) - 1)
 
 
 def _below(state: State, prefix: str) -> State:

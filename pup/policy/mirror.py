@@ -15,6 +15,13 @@ from pup.robot import RobotDescription
 
 IMU = {"roll": -1.0, "pitch": 1.0}
 """Signs of the torso's angles."""
+SIDEWAYS = ("y", "roll", "yaw")
+"""What tells left from right, as in `torso_com/y` and `ground_slope/roll@ground`."""
+DIRECTED = (
+    *("gain_asymmetry", "friction_asymmetry", "cogging", "joint_spring", "joint_stop"),
+    *("encoder_bias", "encoder_eccentricity", "learned_law"),
+)
+"""Effects that tell one direction of a joint from the other, which the mirror may exchange."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,8 @@ class MirrorMap:
           robot: with a mirror map in its `robot.toml`.
           observation: names of the entries; a joint's name, `roll` or `pitch` stands after the
             last `/`, as in `position/l_knee`.
-          parameters: names of mu; those of a group are exchanged with the mirrored joints' group.
+          parameters: names of mu; those of a joint or group are exchanged with those of its mirror
+            image, on the scale of the bounds. What is `unmirrored` stays as it is.
           bins: values an action may take at a joint.
 
         Raises:
@@ -74,7 +82,7 @@ class MirrorMap:
         return cls(
             np.array(entries, dtype=np.int64),
             np.array(signs, dtype=np.float32),
-            _exchanged(robot, partner, parameters),
+            _exchanged(robot, parameters),
             mirrored.ravel(),
             len(joints),
         )
@@ -87,14 +95,43 @@ class MirrorMap:
         return np.where(middle >= self.joints, count - 1 - taken, taken)
 
 
-def _exchanged(
-    robot: RobotDescription, partner: dict[str, str], parameters: Sequence[str]
-) -> NDArray[np.int64]:
-    group = {joint.name: joint.group for joint in robot.joints}
-    other = {group[joint]: group[partner[joint]] for joint in partner}
-    index = {name: i for i, name in enumerate(parameters)}
-    exchanged = []
-    for name in parameters:
-        what, _, where = name.rpartition("/")
-        exchanged.append(index.get(f"{what}/{other.get(where, where)}", index[name]))
+def unmirrored(robot: RobotDescription, parameters: Sequence[str]) -> tuple[str, ...]:
+    """Those of mu whose mirror image is not known or not in mu.
+
+    Raises:
+      InputError: the robot has no mirror map.
+    """
+    image = _images(robot, parameters)
+    return tuple(name for name in parameters if image[name] not in image)
+
+
+def _exchanged(robot: RobotDescription, parameters: Sequence[str]) -> NDArray[np.int64]:
+    index, image = {name: i for i, name in enumerate(parameters)}, _images(robot, parameters)
+    exchanged = [index.get(image[name], index[name]) for name in parameters]
     return np.array(exchanged, dtype=np.int64)
+
+
+def _images(robot: RobotDescription, parameters: Sequence[str]) -> dict[str, str]:
+    """The name of each parameter's mirror image; empty where that is not known.
+
+    They are called as `kp/knee` and `torso_com/x`, those of terms as `backlash/gap@joint:l_knee`.
+    """
+    permutation, _ = robot.mirror()
+    joints = {one.name: robot.joints[permutation[i]] for i, one in enumerate(robot.joints)}
+    groups = {one.group: joints[one.name].group for one in robot.joints}
+    other = {f"joint:{name}": f"joint:{partner.name}" for name, partner in joints.items()}
+    other |= {f"group:{name}": f"group:{partner}" for name, partner in groups.items()}
+    lone = {"", f"body:{robot.torso}", "bus", "ground", "robot", "sensor"}
+    other |= {place: place for place in lone}
+    images = {}
+    for name in parameters:
+        what, at, place = name.partition("@")
+        effect, slash, quantity = what.partition("/")
+        of_group = not at and quantity in groups
+        lateral = quantity in SIDEWAYS and not of_group
+        if lateral or effect in DIRECTED or place not in other:
+            images[name] = ""
+        else:
+            quantity = groups[quantity] if of_group else quantity
+            images[name] = f"{effect}{slash}{quantity}{at}{other[place]}"
+    return images

@@ -92,7 +92,31 @@ class _Graph:
             self._real(self.real)
         done = (*self.plan.stages, "real")
         wanted = [name for name, cell in self._cells.items() if self._stage(cell) in done]
-        return chosen(self._cells, wanted)
+        cells = chosen(self._cells, wanted)
+        self._check_motions(cells)
+        return cells
+
+    def _check_motions(self, cells: Mapping[str, Cell]) -> None:
+        """Refuse types of motion that nobody plays, or that a cell would look for in vain."""
+        from pup.sysid.excitation import possible_kinds
+
+        record, looked_at = self.plan.record, self.plan.diagnosis.motions
+        played, known = [m.partition(":")[0] for m in record.motions], possible_kinds(self.robot)
+        places = {"record: motions": played, "record: fitted": record.fitted}
+        for place, motions in (places | {"diagnosis: motions": looked_at}).items():
+            if unknown := [motion for motion in motions if motion not in known]:
+                raise InputError(f"{place}: {unknown[0]!r} is none of {', '.join(known)}")
+        fitted = set(played).intersection(record.fitted or played)
+        stages = set(map(self._stage, cells.values()))
+        if not fitted and "presysid" in stages:
+            raise InputError("record: no motion is of a type in fitted, which pre-sysID is given")
+        if looked_at and "diagnosis" in stages and not set(played).intersection(looked_at):
+            raise InputError("diagnosis: no motion of record is of a type in motions")
+        if looked_at and "corrected" in stages and not fitted.intersection(looked_at):
+            raise InputError(
+                "diagnosis: motions shares no type with fitted of record, to which corrected "
+                "robots are fitted; add one, or leave corrected and diagnosed out of stages"
+            )
 
     def _stage(self, cell: Cell) -> str:
         """Which stage a cell belongs to."""
@@ -256,9 +280,10 @@ class _Graph:
         files = sorted(folder.glob("*.parquet"))
         if not files:
             raise InputError(f"{folder}: no *.parquet in this folder; see `pup import`")
-        told = {"recordings": {file.name: sha256(file) for file in files}}
+        told: dict[str, Any] = {"recordings": {file.name: sha256(file) for file in files}}
         given = self._given(recordings=str(folder.absolute()))
+        told["motions"] = ()  # all
         fits = self.plan.fleet.told() | {"compare": True}
         self._add(Cell("presysid-real", "presysid", {}, self._told(fits=fits, **told), given, 1e5))
-        plan = asdict(self.plan.diagnosis) | {"rivals": True, "rollouts": 0, "motions": ()}
-        self._add(Cell("diagnosis-real", "diagnosis", {}, self._told(**plan, **told), given, 1e5))
+        plan = asdict(self.plan.diagnosis) | {"rivals": True, "rollouts": 0} | told
+        self._add(Cell("diagnosis-real", "diagnosis", {}, self._told(**plan), given, 1e5))

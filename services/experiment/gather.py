@@ -10,7 +10,7 @@ from services.experiment.diagnosed import diagnoses
 from services.experiment.plan import Plan, Walk
 from services.experiment.run import Order, digest
 from services.experiment.verdicts import acceptance, of_direction
-from services.provenance import engine, now
+from services.provenance import ALSO, engine, now
 
 SCHEMA = 1
 FURTHER = ("own", "corrected")
@@ -51,7 +51,7 @@ def gather(
         "real": _real(found),
         "failed": dict(sorted(failed.items())),
         "cells": {name: _cell(order) for name, order in done.items()},
-        "written_by": engine(),
+        "written_by": engine(ALSO),
         "written": now(),
     }
 

@@ -23,6 +23,8 @@ STAGES = (
 NOT_SAID = ("start", "fitted_to")
 """Of fits, what is the experiment's to say: which files, and what was diagnosed."""
 FITS = Fits(generations=100, subset_generations=50)
+LEAST = {"generations": 1, "population": 4, "subsets": 1, "subset_generations": 1}
+"""Of fits, as for `pup presysid`."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,9 @@ class Train:
 
 
 class _Refusing(argparse.ArgumentParser):
+    def __init__(self, **told: Any) -> None:
+        super().__init__(allow_abbrev=False, **told)  # what is not for a plan is known by its name
+
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
 
@@ -217,6 +222,10 @@ class Plan:
             )
         if min(self.trials.trials, self.trials.prior, self.trials.repeats) < 1:
             raise InputError("trials: trials, prior and repeats must be 1 or more")
+        if min(self.trials.horizon, self.diagnosis.seconds) <= 0:
+            raise InputError("trials: horizon, and seconds of diagnosis, must be above 0")
+        for name, fits in (("presysid", self.presysid), ("fleet", self.fleet)):
+            _check(name, fits)
         if self.diagnosis.effects < 1:
             raise InputError(
                 "diagnosis: effects must be 1 or more; to look for none, leave it out of stages"
@@ -244,6 +253,15 @@ class Plan:
             ]
             plan = replace(plan, walks=tuple(walk for walk in kept if walk.methods))
         return plan
+
+
+def _check(name: str, fits: Fits) -> None:
+    """Refuse fits that would come to nothing, hours later."""
+    for key, least in LEAST.items():
+        if getattr(fits, key) < least:
+            raise InputError(f"{name}: {key} must be {least} or more")
+    if not 0 < fits.fraction <= 1:
+        raise InputError(f"{name}: fraction must be above 0, and 1 at most")
 
 
 def small() -> Plan:
@@ -321,5 +339,8 @@ def _value(table: Table, key: str, kind: Any) -> Any:
     if kind is float:
         return table.number(key)
     if kind == tuple[int, ...]:
-        return tuple(map(int, table.numbers(key)))
+        numbers = table.numbers(key)
+        if broken := [number for number in numbers if not number.is_integer()]:
+            raise table.mistake(key, f"{broken[0]:g} is no whole number")
+        return tuple(map(int, numbers))
     return table.texts(key) if kind == tuple[str, ...] else table.text(key)

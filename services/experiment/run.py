@@ -22,10 +22,12 @@ from services.experiment.work import KINDS, LEFT, RESULT, Task
 from services.failures import ERROR, SHOWN, caught, lost, mended, named
 from services.places import Pools
 from services.progress import Told
-from services.provenance import engine, now
+from services.provenance import ALSO, engine, now
 from services.stages import Journal, Stage
 
 CELLS, AGAIN = "cells", "again"
+NEEDS = "needs "
+"""How what is told of a cell begins that could not be done as another had failed."""
 FILES = "files"
 """Folder of a cell's files, within its own."""
 MADE = "made.json"
@@ -90,16 +92,24 @@ class Order:
     def _work(self) -> None:
         self.files.mkdir(parents=True, exist_ok=True)
         found = KINDS[self.cell.kind](Task(self.cell, self.files, self._needed()))
-        write_json(self.folder / MADE, {"by": engine(), "host": platform.node(), "ended": now()})
+        made = {"by": engine(ALSO), "host": platform.node(), "ended": now()}
+        write_json(self.folder / MADE, made)
         write_json(self.files / RESULT, {"schema": 1, "cell": self.cell.name, "result": found})
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cell: how long it took, s, or what went wrong."""
+    """What became of a cell.
+
+    Attributes:
+      seconds: that it took.
+      error: what went wrong; empty where nothing did.
+      mistaken: whether that was bad input, which is as bad another time.
+    """
 
     seconds: float = 0.0
     error: str = ""
+    mistaken: bool = False
 
 
 class _Agenda:
@@ -109,14 +119,14 @@ class _Agenda:
       cells: all, each after those that it needs.
       left: those of which nothing is known yet.
       done: those that are there.
-      failed: those that are not to be had, and why.
+      failed: those that are not to be had, and what became of them.
       whole: of all the work, what was not there at the beginning.
       spent: of it, what is done or failed.
     """
 
     def __init__(self, cells: Mapping[str, Cell], out: Path) -> None:
         self.cells, self.out = cells, out.absolute()
-        self.left, self.done, self.failed = dict(cells), set[str](), dict[str, str]()
+        self.left, self.done, self.failed = dict(cells), set[str](), dict[str, Outcome]()
         self.whole, self.spent = sum(cell.weight for cell in cells.values()), 0.0
         self._way: dict[str, float] = {}
         for cell in reversed(cells.values()):
@@ -130,7 +140,7 @@ class _Agenda:
         due = []
         for cell in list(self.left.values()):
             if missing := [need for need in cell.needs.values() if need in self.failed]:
-                self.settle(self.left.pop(cell.name), f"needs {missing[0]}")
+                self.settle(self.left.pop(cell.name), Outcome(error=f"{NEEDS}{missing[0]}"))
             elif self.done.issuperset(cell.needs.values()):
                 order = Order(self.left.pop(cell.name), self.out)
                 if order.done:
@@ -140,11 +150,11 @@ class _Agenda:
                     due.append(order)
         return sorted(due, key=lambda order: -self._way[order.cell.name])
 
-    def settle(self, cell: Cell, error: str) -> None:
+    def settle(self, cell: Cell, outcome: Outcome) -> None:
         """A cell is done, or failed where there is an error."""
         self.spent += cell.weight
-        if error:
-            self.failed[cell.name] = error
+        if outcome.error:
+            self.failed[cell.name] = outcome
         else:
             self.done.add(cell.name)
 
@@ -154,7 +164,7 @@ class _Agenda:
         return self.spent / self.whole if self.whole else 1.0
 
 
-def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) -> dict[str, str]:
+def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) -> dict[str, Outcome]:
     """Do the cells that are not done.
 
     Args:
@@ -164,7 +174,7 @@ def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) ->
       tell: told how many are done.
 
     Returns:
-      The cells that failed, or could not be done as others had failed, and why.
+      The cells that failed, or could not be done as others had failed, and what became of them.
     """
     agenda, running, note = _Agenda(cells, out), 0, ""
     with closing(pools(work_on)) as pool:
@@ -178,7 +188,7 @@ def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) ->
             order, outcome = pool.settled()
             running -= 1
             told = _settled(order, outcome)
-            agenda.settle(order.cell, told.error)
+            agenda.settle(order.cell, told)
             end = f"failed, {told.error}" if told.error else f"in {told.seconds:.0f} s"
             note = f"{order.cell.name} {end}"
 
@@ -190,18 +200,24 @@ def work_on(order: Order) -> Outcome:
         order.folder.mkdir(parents=True, exist_ok=True)
         Journal(order.folder).once(order.stage())
     except Exception as error:  # whatever it is, other cells go on
-        return Outcome(error=caught(order.folder, error))
+        why = caught(order.folder, error)
+        return Outcome(error=why, mistaken=isinstance(error, InputError))
     mended(order.folder)
     return Outcome(time.monotonic() - begin)
 
 
-def complaint(failed: Mapping[str, str], out: Path) -> str:
-    """Which cells failed, in a line."""
-    own = {name: why for name, why in failed.items() if not why.startswith("needs ")}
-    return (
+def failure(failed: Mapping[str, Outcome], out: Path) -> InputError | ChildProcessError:
+    """What to raise of cells that failed: bad input only where nothing else went wrong.
+
+    What was lost with a node may be done by the same command.
+    """
+    own = {name: told for name, told in failed.items() if not told.error.startswith(NEEDS)}
+    line = (
         f"{out}: {len(own)} cells failed and {len(failed) - len(own)} need them, see "
-        f"{CELLS}/*/{ERROR}; the same command tries them again: {named(own)}"
+        f"{CELLS}/*/{ERROR}; the same command tries them again: "
+        f"{named({name: told.error for name, told in own.items()})}"
     )
+    return _raised(line, all(told.mistaken for told in own.values()))
 
 
 def run_again(
@@ -223,14 +239,15 @@ def run_again(
       Whether both `agree`, the digests of what they found, and their folders.
 
     Raises:
-      InputError: there is no such cell, or it fails.
+      InputError: there is no such cell, or what it is given is bad.
+      ChildProcessError: it fails otherwise.
     """
     if name not in cells:
         raise InputError(f"--cell {name}: there is none; {', '.join(list(cells)[:SHOWN])}, ...")
     needed = chosen(cells, [name])
     failed = run_cells(needed, out, pools, tell)
     if failed:
-        raise InputError(complaint(failed, out))
+        raise failure(failed, out)
     first = Order(cells[name], out.absolute())
     second = Order(cells[name], out.absolute(), AGAIN)
     if second.done:
@@ -239,7 +256,7 @@ def run_again(
         pool.begin(second)
         told = _settled(*pool.settled())
     if told.error:
-        raise InputError(f"{second.folder}: {told.error}")
+        raise _raised(f"{second.folder}: {told.error}", told.mistaken)
     found = {str(o.folder): digest(o.result()) for o in (first, second)}
     return {"cell": name, "agree": len(set(found.values())) == 1, "results": found}
 
@@ -247,6 +264,10 @@ def run_again(
 def digest(result: Mapping[str, Any]) -> str:
     """SHA-256 of what a cell found."""
     return hashlib.sha256(json.dumps(result, sort_keys=True).encode()).hexdigest()
+
+
+def _raised(line: str, mistaken: bool) -> InputError | ChildProcessError:
+    return InputError(line) if mistaken else ChildProcessError(line)
 
 
 def _settled(order: Order, outcome: Any) -> Outcome:

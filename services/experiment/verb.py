@@ -11,7 +11,7 @@ from pup.policy.shape import Method
 from services import places
 from services.experiment.cells import graph
 from services.experiment.plan import Plan, read_plan, small
-from services.experiment.run import complaint, run_again, run_cells
+from services.experiment.run import failure, run_again, run_cells
 from services.experiment.work import quiet
 from services.progress import counted
 
@@ -22,7 +22,8 @@ def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
     """Do an experiment, or one of its cells again.
 
     Raises:
-      InputError: the plan cannot be done, or some of its cells failed.
+      InputError: the plan cannot be done, or some of its cells failed for bad input alone.
+      ChildProcessError: some failed otherwise.
     """
     from services.experiment.gather import gather
     from services.experiment.report import write_report
@@ -39,11 +40,12 @@ def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
         if options.cell is not None:
             return run_again(cells, options.cell, out, pools, tell)
         failed = run_cells(cells, out, pools, tell)
-    document = gather(plan, cells, failed, out.absolute())
+    why = {name: told.error for name, told in failed.items()}
+    document = gather(plan, cells, why, out.absolute())
     write_json(out / EXPERIMENT, document)
     write_report(document, out / REPORT)
     if failed:
-        raise InputError(complaint(failed, out))
+        raise failure(failed, out)
     return {"experiment": document, "report": str(out / REPORT)}
 
 
