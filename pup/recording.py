@@ -280,6 +280,23 @@ def load_recordings(
     return tuple(sorted(recordings, key=lambda recording: recording.id))
 
 
+def originals(recordings: Sequence[Recording]) -> list[str]:
+    """The id of what each recording repeats in the end, its own where that is nothing.
+
+    Where several repeat one another, it is one of them.
+    """
+    repeats = {recording.id: recording.repeat_of for recording in recordings}
+
+    def first(name: str) -> str:
+        seen: list[str] = []
+        while (before := repeats.get(name)) is not None and name not in seen:
+            seen.append(name)
+            name = before
+        return min(seen[seen.index(name) :]) if name in seen else name
+
+    return [first(recording.id) for recording in recordings]
+
+
 def write_recordings(recordings: Sequence[Recording], folder: Path) -> tuple[Path, ...]:
     """Write recordings into a folder, named by their ids: all of them or, on an error, none.
 

@@ -19,7 +19,7 @@ from pup.errors import InputError
 from pup.files import read_json
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
-from pup.recording import Recording
+from pup.recording import Recording, originals
 from pup.robot import Actuator, RobotDescription
 from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range, widened
 from pup.sysid.fit import FitResult, FitSettings
@@ -360,7 +360,7 @@ def _movable(space: ParameterSpace) -> list[str]:
 
 def _originals(recordings: Sequence[Recording]) -> list[tuple[str, ...]]:
     """Of each recording, what it is or repeats."""
-    return [(r.motion, r.repeat_of or r.id) for r in recordings]
+    return list(zip([r.motion for r in recordings], originals(recordings), strict=True))
 
 
 def _described_at(problem: Problem) -> Array:

@@ -16,6 +16,7 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import LOST
 from pup.diagnosis.starts import Tried
+from pup.diagnosis.verdict import probabilities
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
 from tests.diagnoses import ENOUGH, Maker
@@ -68,6 +69,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> None:
     for room in (exchanges, selection):
         for name in ("fit_together", "closely"):
             monkeypatch.setattr(room, name, nothing)
+    monkeypatch.setattr(exchanges, "start_best", nothing)
 
 
 def chosen(before: Model, *finalists: Model) -> Round:
@@ -112,6 +114,40 @@ class TestSwaps:
         assert swap is not None
         assert [m.hypotheses[-1] for m in swap.finalists] == [RIVAL, FIRST, OTHER]
         assert swap.holding == 2
+
+
+class TestSettled:
+    """The first of two effects, compared with its rivals once more beside the second."""
+
+    found = made((FIRST, LAST), 400.0)
+    rounds = (
+        chosen(made((), 1000.0), made((FIRST,), 700.0), made((RIVAL,), 702.0)),
+        chosen(made((FIRST,), 700.0), found),
+    )
+
+    def test_a_rival_that_explains_less_by_now_is_one_no_more(self) -> None:
+        """What others left had blurred them; the round says how they compare now."""
+        selector = Made({(LAST, RIVAL): 480.0, (LAST,): 900.0})
+        model, rounds = selector.settled(self.found, self.rounds)
+        assert model is self.found
+        assert len(rounds) == 3
+        assert rounds[2].again and rounds[2].before.hypotheses == (LAST,)
+        assert [m.hypotheses[-1] for m in rounds[2].finalists] == [FIRST, RIVAL]
+        then = probabilities(self.rounds[0].finalists, self.rounds[0].before, MAKER.noise)
+        now = probabilities(rounds[2].finalists, rounds[2].before, MAKER.noise)
+        assert then[1] > 0.4 and now[1] < 0.05
+
+    def test_one_that_is_worth_more_takes_its_place(self) -> None:
+        """By however little: nothing speaks for the one that was first."""
+        selector = Made({(LAST, RIVAL): 399.0, (LAST,): 900.0})
+        model, rounds = selector.settled(self.found, self.rounds)
+        assert model.hypotheses == (LAST, RIVAL)
+        assert [m.hypotheses[-1] for m in rounds[2].finalists] == [RIVAL, FIRST]
+
+    def test_what_was_found_beside_all_others_is_not_compared_again(self) -> None:
+        model = made((LAST,), 400.0)
+        rounds = [chosen(made((), 1000.0), model, made((RIVAL,), 402.0))]
+        assert Made({}).settled(model, rounds) == (model, rounds)
 
 
 class TestTheLast:

@@ -6,7 +6,7 @@ roll or pitch. Errors of one channel in one recording form a run, whose noise ma
 tick to tick; `whiten` makes any such errors, or sensitivities, of unit variance and uncorrelated.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -17,7 +17,7 @@ from scipy.linalg import solve_banded
 
 from pup.diagnosis.knocks import knocked
 from pup.physics.simulator import Trajectories, tick_slices
-from pup.recording import Recording
+from pup.recording import Recording, originals
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
@@ -190,19 +190,9 @@ class Measured:
     def families(self) -> dict[str, list[int]]:
         """The recordings of each motion, with those that do it again."""
         told: dict[str, list[int]] = {}
-        repeats = {recording.id: recording.repeat_of for recording in self.recordings}
-        for number, recording in enumerate(self.recordings):
-            told.setdefault(_first(recording.id, repeats), []).append(number)
+        for number, first in enumerate(originals(self.recordings)):
+            told.setdefault(first, []).append(number)
         return told
-
-
-def _first(name: str, repeats: Mapping[str, str | None]) -> str:
-    """What a recording repeats in the end; where several repeat one another, one of them."""
-    seen: list[str] = []
-    while (before := repeats.get(name)) is not None and name not in seen:
-        seen.append(name)
-        name = before
-    return min(seen[seen.index(name) :]) if name in seen else name
 
 
 def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:

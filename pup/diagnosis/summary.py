@@ -19,6 +19,7 @@ from pup.diagnosis.regimes import Window, windows
 from pup.diagnosis.selection import KEPT, unimitated
 from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
 from pup.physics.terms import Place
+from pup.recording import originals
 
 Array = NDArray[np.float64]
 
@@ -297,10 +298,12 @@ def telling(diagnosis: Diagnosis, finding: Finding, most: int) -> list[View]:
         return _views(diagnosis, finding.when, errors, allowed)[:most]
     gain = _squares(diagnosis, both["nominal"]) - _squares(diagnosis, both["corrected"])
     views = _views(diagnosis, finding.when, gain, allowed)
+    recordings = diagnosis.measured.recordings
+    first = dict(zip([r.id for r in recordings], originals(recordings), strict=True))
     better: dict[object, View] = {}
     for view in views:
         if _drop(diagnosis, view) > BETTER:  # of repeats, one will do
-            better.setdefault((_first(diagnosis, view.window.recording), view.start), view)
+            better.setdefault((first[view.window.recording], view.start), view)
     return (list(better.values()) or views[:1])[:most]
 
 
@@ -311,11 +314,6 @@ def _members(diagnosis: Diagnosis, place: Place) -> list[int]:
         return channels(diagnosis)
     of = [getattr(joint, kinds[place.kind]) for joint in diagnosis.robot.joints]
     return [i for i, name in enumerate(of) if name == place.name]
-
-
-def _first(diagnosis: Diagnosis, name: str) -> str:
-    """The recording that another one repeats, or itself."""
-    return next(r.repeat_of or r.id for r in diagnosis.measured.recordings if r.id == name)
 
 
 def _drop(diagnosis: Diagnosis, view: View) -> float:
