@@ -1,7 +1,6 @@
 """The pre-sysID job: recordings in, `bounds.json` and `report.html` out (paper, section III)."""
 
 import hashlib
-import json
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.nominal import FREE as FITTED_BY_DIAGNOSIS
 from pup.errors import InputError
-from pup.files import read_json
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
 from pup.recording import Recording, originals
@@ -120,7 +118,7 @@ class _Job:
         )
         subsets = self._subsets(bounded)
         bounds = self._bounds(bounded, fitted, held_out, subsets, begin)
-        bounds = _as_before(bounds, self.out / "bounds.json")
+        bounds = bounds.as_before(self.out / "bounds.json")
         bounds.write(self.out / "bounds.json")
         replays = {a: p.replay(fitted[a].best[None]) for a, p in full.items()}
         labels = {"nn_pd": "NN-PD", "pd": "PD"}
@@ -336,21 +334,6 @@ class _Job:
             "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
             "seconds": round(seconds, 1),
         }
-
-
-def _as_before(bounds: Bounds, file: Path) -> Bounds:
-    """The same with the seconds that the file tells, where it tells the same but for these.
-
-    Trainings and studies know bounds by the SHA-256 of their file: what is made again from its
-    checkpoints must be the same to the last byte.
-    """
-    try:
-        before = read_json(file)
-        provenance = bounds.provenance | {"seconds": before["provenance"]["seconds"]}
-    except (InputError, LookupError, TypeError):  # there is none, or it is something else
-        return bounds
-    again = replace(bounds, provenance=provenance)
-    return again if json.loads(json.dumps(again.document())) == before else bounds
 
 
 def _movable(space: ParameterSpace) -> list[str]:

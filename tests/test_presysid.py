@@ -166,7 +166,7 @@ def test_bounds_that_are_made_again_are_the_same_file(
     assert other != first and bounds.provenance["seconds"] != same.provenance["seconds"]
     for spoilt in ("[]", "{}", '{"provenance": 1}', "{"):
         file.write_text(spoilt)
-        assert presysid._as_before(bounds, file) is bounds
+        assert bounds.as_before(file) is bounds
 
 
 class Moved(Idle):

@@ -1,6 +1,7 @@
 """The outcome of pre-sysID and its file, `bounds.json` (CONTRACTS.md, section 4)."""
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,20 @@ class Bounds:
     histories: dict[str, Array]
     omitted: tuple[str, ...]
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    def as_before(self, file: Path) -> "Bounds":
+        """The same with the seconds that a file tells, where it tells the same but for these.
+
+        Trainings and studies know bounds by the SHA-256 of their file: what is made again from its
+        checkpoints must be the same to the last byte.
+        """
+        try:
+            before = read_json(file)
+            provenance = self.provenance | {"seconds": before["provenance"]["seconds"]}
+        except (InputError, LookupError, TypeError):  # there is none, or it is something else
+            return self
+        again = replace(self, provenance=provenance)
+        return again if json.loads(json.dumps(again.document())) == before else self
 
     def write(self, path: Path) -> None:
         """Write `bounds.json`."""
