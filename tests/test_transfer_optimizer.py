@@ -107,6 +107,25 @@ def test_one_lucky_walk_does_not_decide():
     assert chosen.hyperparameters["noise"] > 0.05
 
 
+def test_the_best_is_walked_again_before_it_is_kept():
+    """One that walks far once and falls the next time is not: three of 25 walks make sure."""
+    rng = np.random.default_rng(0)
+    eta = np.vstack([rng.uniform(-1, 1, (21, 3)), [[0.9, 0.9, 0.9]]])
+    asked = replace(search(eta, np.append(rng.normal(3.0, 0.05, 21), 3.6)), trials=25)
+    for falls in range(3):
+        again = suggest(asked, 23 + falls)
+        assert any(np.allclose(again.eta, known) for known in asked.eta)
+        assert again.is_worth(0.5) and "once more" in again.why
+        lucky = np.allclose(again.eta, 0.9)
+        assert lucky or falls
+        distance = np.append(asked.distance, 0.2 if lucky else 3.0)
+        asked = replace(asked, eta=np.vstack([asked.eta, again.eta]), distance=distance)
+    assert not np.allclose(choose(asked).eta, 0.9)
+    assert np.allclose(choose(replace(asked, eta=eta, distance=distance[:22])).eta, 0.9)
+    early = suggest(replace(asked, eta=eta[:21], distance=distance[:21]), 22)
+    assert "improvement" in early.why
+
+
 def test_simulated_landscapes_lead_to_a_good_eta_in_few_walks():
     simulated = simulate()
     with_prior, without = [], []

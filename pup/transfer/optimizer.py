@@ -33,6 +33,9 @@ NEARBY = 128
 """Etas around the best ones so far."""
 STARTS = 4
 """Best of them, from which the acquisition is climbed."""
+CONFIRMED = 0.12
+"""Share of all walks, the last ones, that are of the best eta so far: 3 of 25. On the edge of a
+fall one walks far once and falls the next time, which one walk of each does not tell."""
 FEWEST = 4
 """Walks before which no search is over: distances that are alike may be so by chance."""
 SAMPLES = 64
@@ -52,6 +55,7 @@ class Search:
       distance: of them, m, shape (n,).
       simulated: rollouts to start from, or None.
       feasible: which walks were, shape (n,); None for all. The others are never chosen.
+      trials: walks that there will be; None where that is not known.
     """
 
     lower: Eta
@@ -62,6 +66,7 @@ class Search:
     distance: Array
     simulated: Simulated | None = None
     feasible: NDArray[np.bool_] | None = None
+    trials: int | None = None
 
     def __post_init__(self) -> None:
         if self.eta.shape != (len(self.distance), len(self.lower)):
@@ -87,6 +92,13 @@ class Search:
         if self.simulated is None:
             return None
         return landscapes(self.simulated, np.array(self.lower), np.array(self.upper))
+
+    @property
+    def confirming(self) -> bool:
+        """Whether the walks that are left shall make sure of the best."""
+        if self.trials is None or (self.feasible is not None and not self.feasible.any()):
+            return False
+        return len(self.distance) >= self.trials - int(CONFIRMED * self.trials)
 
     def best(self, surrogate: Surrogate) -> Array:
         """Of the feasible etas tried, the one with the largest posterior mean, on the unit cube.
@@ -174,6 +186,10 @@ def suggest(search: Search, number: int) -> Decision:
         )
     surrogate = surrogate_of(search.told, search.prior)
     rng = np.random.default_rng((search.seed, number))
+    if search.confirming:
+        unit = search.best(surrogate)
+        why = "the best so far, once more before one is kept"
+        return _decision(search, surrogate, unit, Purpose.SEARCH, why, began)
     if len(search.distance):
         unit, gain = _improve(surrogate, search.told, rng)
         best = float(surrogate.predict(search.told.eta)[0].max())

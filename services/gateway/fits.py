@@ -103,6 +103,7 @@ def search_of(study: Study, simulated: Row | None) -> Any:
         distance,
         used and Simulated(np.array(used["eta"], float), np.array(used["distance"], float)),
         feasible,
+        settings.trials,
     )
 
 
