@@ -67,11 +67,17 @@ class Recorded:
         return self._best
 
 
-def ours(seed: int, simulated: Any = None, least_gain: float = 0.0) -> Session:
+def ours(
+    seed: int,
+    simulated: Any = None,
+    least_gain: float = 0.0,
+    trials: int | None = max(LOOKS),
+) -> Session:
     from pup.transfer.optimizer import Search, choose, suggest
 
     def search(eta: Array, distance: Array) -> Search:
-        return Search((-1.0,) * 3, (1.0,) * 3, 5, seed, eta, distance, simulated)
+        box = (-1.0,) * 3, (1.0,) * 3
+        return Search(*box, 5, seed, eta, distance, simulated, trials=trials)
 
     eta, distance = np.zeros((0, 3)), np.zeros(0)
     number = 0
@@ -91,6 +97,10 @@ def ours(seed: int, simulated: Any = None, least_gain: float = 0.0) -> Session:
 
 def frugal(seed: int) -> Session:
     return ours(seed, least_gain=0.002)
+
+
+def unsure(seed: int) -> Session:
+    return ours(seed, trials=None)
 
 
 def warm(seed: int) -> Session:
@@ -162,6 +172,7 @@ def ax(seed: int) -> Session:
 
 RIVALS: dict[str, tuple[Callable[[int], Session], str]] = {
     "pup": (ours, "botorch"),
+    "pup, no walk made sure": (unsure, "botorch"),
     "pup, as long as worth a walk": (frugal, "botorch"),
     "pup, simulated prior": (warm, "botorch"),
     "Ax": (ax, "ax"),
