@@ -25,7 +25,7 @@ from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.figures import INK, SOFT, as_png, drawing_style, new_figure
 from pup.sysid.result import read_bounds
-from pup.transfer.study import TrialState
+from pup.transfer.trial import TrialState
 
 Array = NDArray[np.float64]
 

@@ -316,7 +316,7 @@ def test_the_store_writes_a_change_whole_or_not_at_all(tmp_path):
         conductor = Conductor(store, InProcess(), Metrics())
         conductor._go_on = lambda name: None
         study, _ = await conductor.create("s", SETTINGS, None, "test")
-        from pup.transfer.study import Purpose, Trial
+        from pup.transfer.trial import Purpose, Trial
         from services.gateway.store import Event
 
         trial = Trial("s", 1, (0.0, 0.0, 0.0), Purpose.INITIAL)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from pup.errors import InputError
 from pup.transfer.optimizer import Search, choose, slices, suggest
-from pup.transfer.study import Purpose
 from pup.transfer.surrogate import Simulated
+from pup.transfer.trial import Purpose
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)

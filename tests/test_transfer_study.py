@@ -10,15 +10,13 @@ from hypothesis import strategies as st
 from pup.errors import InputError
 from pup.transfer import orders
 from pup.transfer.steps import Choose, Finish, Suggest, Wait, Walk, next_step
-from pup.transfer.study import (
+from pup.transfer.study import Study, StudySettings, StudyState
+from pup.transfer.trial import (
     HANDED_OUT,
     OPEN,
     TOLD,
     Purpose,
     Result,
-    Study,
-    StudySettings,
-    StudyState,
     Ticket,
     Trial,
     TrialError,

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from pup.errors import InputError
-from pup.transfer.study import Eta, Purpose
 from pup.transfer.surrogate import Landscapes, Simulated, Surrogate, Told, landscapes, surrogate_of
+from pup.transfer.trial import Eta, Purpose
 
 Array = NDArray[np.float64]
 

@@ -2,15 +2,8 @@
 
 from dataclasses import replace
 
-from pup.transfer.study import (
-    HANDED_OUT,
-    TOLD,
-    Study,
-    StudyState,
-    Trial,
-    TrialError,
-    TrialState,
-)
+from pup.transfer.study import Study, StudyState
+from pup.transfer.trial import HANDED_OUT, TOLD, Trial, TrialError, TrialState
 
 HOPELESS = 3
 """Trials in a row of which none walked, after which an infeasible one pauses a study."""

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from pup.transfer.study import Eta, Purpose, Study, StudyState
+from pup.transfer.study import Study, StudyState
+from pup.transfer.trial import Eta, Purpose
 
 
 @dataclass(frozen=True)

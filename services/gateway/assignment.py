@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 
-from pup.transfer.study import HANDED_OUT, Study, StudyState, Trial, TrialState
+from pup.transfer.study import Study, StudyState
+from pup.transfer.trial import HANDED_OUT, Trial, TrialState
 from pup.wire import Assign
 from services.gateway.agents import AgentView
 

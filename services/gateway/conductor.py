@@ -1,7 +1,7 @@
 """Lets studies go on: suggests trials, hands them out, hears how they end.
 
 What keeps a walk from being lost, made twice or told twice: a change is computed by
-`pup.transfer.study`, written to the store, and only then kept in memory, sent or acknowledged. A
+`pup.transfer.trial`, written to the store, and only then kept in memory, sent or acknowledged. A
 gateway that dies between any two of these finds in the store what it had decided and goes on from
 there: it sends the same assignment with the same fence again, and the agent sends its result again
 until it is acknowledged.
@@ -21,14 +21,11 @@ from typing import Any
 from pup.errors import InputError
 from pup.transfer import orders
 from pup.transfer.steps import Choose, Finish, Step, Suggest, Wait, Walk, next_step
-from pup.transfer.study import (
+from pup.transfer.study import Gate, Study, StudySettings, StudyState
+from pup.transfer.trial import (
     HANDED_OUT,
-    Gate,
     Purpose,
     Result,
-    Study,
-    StudySettings,
-    StudyState,
     Ticket,
     Trial,
     TrialError,

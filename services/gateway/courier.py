@@ -4,7 +4,8 @@ import time
 from collections.abc import Mapping
 from typing import Protocol
 
-from pup.transfer.study import HANDED_OUT, Study, Trial
+from pup.transfer.study import Study
+from pup.transfer.trial import HANDED_OUT, Trial
 from pup.wire import Body, Cancel
 from services.gateway.agents import AgentView
 from services.gateway.assignment import assignment

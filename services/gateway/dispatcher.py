@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pup.errors import InputError
-from pup.transfer.study import TrialError
+from pup.transfer.trial import TrialError
 from services.gateway.conductor import UnknownError
 from services.gateway.jobs import Job, JobState, Seen, Status, reconciled
 from services.gateway.metrics import Metrics

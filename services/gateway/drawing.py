@@ -4,7 +4,8 @@ import math
 from collections.abc import Sequence
 from html import escape
 
-from pup.transfer.study import Purpose, Study, Trial, TrialState
+from pup.transfer.study import Study
+from pup.transfer.trial import Purpose, Trial, TrialState
 from services.gateway.records import Row
 
 WIDTH, HEIGHT = 440, 220

@@ -12,7 +12,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from pup.transfer.study import Study, TrialState
+from pup.transfer.study import Study
+from pup.transfer.trial import TrialState
 from services.gateway.records import Row
 
 P = ParamSpec("P")

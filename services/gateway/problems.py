@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from pup.errors import InputError
-from pup.transfer.study import TrialError
+from pup.transfer.trial import TrialError
 from services.gateway.conductor import UnknownError
 from services.gateway.dispatcher import NoJobsError
 

@@ -3,16 +3,8 @@
 from dataclasses import asdict, fields
 from typing import Any
 
-from pup.transfer.study import (
-    Gate,
-    Purpose,
-    Result,
-    Study,
-    StudySettings,
-    StudyState,
-    Trial,
-    TrialState,
-)
+from pup.transfer.study import Gate, Study, StudySettings, StudyState
+from pup.transfer.trial import Purpose, Result, Trial, TrialState
 from services.gateway.jobs import Attempt, Job, JobState
 
 Row = dict[str, Any]

@@ -6,8 +6,9 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 
 from pup.errors import InputError
-from pup.transfer.study import Gate, Purpose, StudyState, TrialState
+from pup.transfer.study import Gate, StudyState
 from pup.transfer.study import StudySettings as Defaults
+from pup.transfer.trial import Purpose, TrialState
 from services.gateway.names import WHOLE
 from services.gateway.records import Row
 

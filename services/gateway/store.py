@@ -20,7 +20,8 @@ from alembic.util import CommandError
 from sqlalchemy.exc import SQLAlchemyError
 
 from pup.errors import InputError
-from pup.transfer.study import Study, Trial
+from pup.transfer.study import Study
+from pup.transfer.trial import Trial
 from services.gateway.jobs import Job
 from services.gateway.records import Row, job_of, job_row, study_of, study_row, trial_row
 
