@@ -231,7 +231,7 @@ def test_a_recording_in_pieces_is_joined_once(service, keys, context):
     while sent - heard and socket.poll(10_000):
         if isinstance(told := decode(socket.recv()).body, Acknowledge):
             heard.add(told.of)
-    assert heard == sent and bad.id not in heard
+    assert heard & {*sent, bad.id} == sent  # of what fuzzing has left, answers may come too
     assert (service.data / "recordings/honest/walk-7.parquet").read_bytes() == data
     assert [p.name for p in (service.data / "recordings/honest").iterdir()] == ["walk-7.parquet"]
     socket.close()

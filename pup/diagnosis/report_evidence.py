@@ -103,11 +103,9 @@ def _refits(diagnosis: Diagnosis, speech: Speech, chosen: Round) -> Iterator[Htm
     best = finalists[0]
     inside = np.array([r.inside for r in finalists])
     outside = np.array([r.outside for r in finalists])
-    verdict = (
-        "was added"
-        if chosen.accepted
-        else f"was not added: {summary.why_rejected(chosen, diagnosis)}"
-    )
+    verdict = "is kept" if chosen.again else "was added"
+    if not chosen.accepted:
+        verdict = f"was not added: {summary.why_rejected(chosen, diagnosis)}"
     takeaway = f"{capital(names[0])} explains most where it was not fitted, and {verdict}."
     if not np.isclose(outside[0], outside.max()):
         takeaway = f"{capital(names[0])} is best by fit, prediction and simplicity, and {verdict}."
