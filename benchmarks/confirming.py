@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_agent.virtual.fleet import Fleet
-from hardware_agent.virtual.walks import walk
+from benchmarks.post_sysid import Grid
 from pup.files import read_json
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
 from pup.transfer.optimizer import Search, choose
-from services.laboratory import RATE
 
 Array = NDArray[np.float64]
 
@@ -45,41 +43,28 @@ def searched(study: dict[str, Any]) -> Search:
     )
 
 
-class Robot:
-    """The robot of a study, without its bus.
+def walker(cell: Path, study: dict[str, Any]) -> Grid:
+    """The robot of a study's cell, without its bus."""
+    found = re.search(r"-r(\d+)-(\w+)-(\w+)$", cell.name)
+    assert found is not None, f"{cell} is no cell of trials"
+    robot = RobotDescription.load(study["robot"])
+    bundle = cell.parent / f"policy-{found[2]}-{found[3]}" / "files" / "policy"
+    policy = NumpyPolicy.load(bundle, robot)
+    return Grid(robot, policy, int(found[1]), study["settings"]["horizon"])
 
-    Args:
-      cell: folder of the study's cell.
-    """
 
-    def __init__(self, cell: Path) -> None:
-        found = re.search(r"-r(\d+)-(\w+)-(\w+)$", cell.name)
-        assert found is not None, f"{cell} is no cell of trials"
-        self.seed, policy = int(found[1]), f"policy-{found[2]}-{found[3]}"
-        self.study = read_json(cell / "files" / "study.json")
-        self.robot = RobotDescription.load(self.study["robot"])
-        bundle = cell.parent / policy / "files" / "policy"
-        self.policy = NumpyPolicy.load(bundle, self.robot)
-
-    def walks(self, eta: Array, draw: int) -> Array:
-        """Distances of some etas, shape (n,), m."""
-        fleet = Fleet(self.robot, [self.seed] * len(eta))
-        horizon = self.study["settings"]["horizon"]
-        return walk(fleet, self.policy, eta, horizon, 1 / RATE, draw).distance
-
-    def chosen(self, again: int) -> Array:
-        """The eta that is kept where the last walks are of the best so far."""
-        search = searched(self.study)
-        first = len(search.distance) - again
-        search = replace(search, eta=search.eta[:first], distance=search.distance[:first])
-        for draw in range(FIRST_AGAIN, FIRST_AGAIN + again):
-            best = np.array(choose(search).eta)[None]
-            search = replace(
-                search,
-                eta=np.vstack([search.eta, best]),
-                distance=np.append(search.distance, self.walks(best, draw)),
-            )
-        return np.array(choose(search).eta)
+def chosen(search: Search, robot: Grid, again: int) -> Array:
+    """The eta that is kept where the last walks are of the best so far."""
+    first = len(search.distance) - again
+    search = replace(search, eta=search.eta[:first], distance=search.distance[:first])
+    for draw in range(FIRST_AGAIN, FIRST_AGAIN + again):
+        best = np.array(choose(search).eta)[None]
+        search = replace(
+            search,
+            eta=np.vstack([search.eta, best]),
+            distance=np.append(search.distance, robot.walked(best, draw)),
+        )
+    return np.array(choose(search).eta)
 
 
 def main() -> None:
@@ -90,10 +75,11 @@ def main() -> None:
     given = parser.parse_args()
     means = []
     for cell in given.cells:
-        robot = Robot(cell)
-        eta = np.array([robot.chosen(again) for again in given.again])
+        study = read_json(cell / "files" / "study.json")
+        robot, search = walker(cell, study), searched(study)
+        eta = np.array([chosen(search, robot, again) for again in given.again])
         draws = range(FIRST_JUDGED, FIRST_JUDGED + given.walks)
-        distance = np.array([robot.walks(eta, draw) for draw in draws])
+        distance = np.array([robot.walked(eta, draw) for draw in draws])
         means.append(distance.mean(axis=0))
         told = {
             str(again): {"mean": round(float(mean), 3), "least": round(float(least), 3)}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.fitting import Fit, fit_together, start_best
 from pup.diagnosis.hypotheses import Hypothesis
-from pup.diagnosis.models import Model, Round, chosen_in
+from pup.diagnosis.models import Model, Round, chosen_in, last_rounds
 from pup.diagnosis.selection import MARGIN, ROUGH, Selector
 from pup.diagnosis.starts import Tried, closely, joined, less
 from pup.diagnosis.verdict import probabilities
@@ -92,7 +92,7 @@ class Exchanger(Selector):
     def _exchanges(self, model: Model, rounds: Sequence[Round]) -> list[tuple[int, Tried]]:
         """Models with a rival in place of an effect, and which of them that is."""
         known = {h.key for h in model.hypotheses}
-        last = {r.chosen.key: r for r in rounds if r.accepted}
+        last = last_rounds(rounds)
         ways: list[tuple[int, Tried]] = []
         for number, hypothesis in enumerate(model.hypotheses):
             others = tuple(h for h in model.hypotheses if h is not hypothesis)
@@ -136,7 +136,7 @@ class Exchanger(Selector):
     ) -> Round | None:
         """The round of one effect beside all others; None where it was one, or has no rival."""
         others = tuple(h for h in model.hypotheses if h is not hypothesis)
-        chosen = next((r for r in reversed(rounds) if _chose(r, hypothesis)), None)
+        chosen = last_rounds(rounds).get(hypothesis.key)
         if chosen is None or set(others) == set(chosen.before.hypotheses):
             return None
         fit = less(model.fit, hypothesis)
@@ -152,7 +152,7 @@ class Exchanger(Selector):
         closely([f for f in fits if f.chi2 < near], self.replays, self.noise)
         before = self.model(others, fit) if others else self.nominal
         holds, rest = self.parted(before, self.models(tried))
-        known_as = replace(self.ended(model), hypotheses=(*others, hypothesis))
+        known_as = replace(model, hypotheses=(*others, hypothesis))
         holds = sorted([known_as, *holds], key=lambda m: m.worth)
         return Round(before, chosen.ranking, (*holds, *rest), len(holds), again=True)
 
@@ -175,7 +175,3 @@ def _places(fit: Fit, found: Fit) -> list[Array]:
         own.get(n, at) if "@" not in n else at for n, at in zip(fit.names, fit.at, strict=True)
     ]
     return [fit.at, np.array(nominal)]
-
-
-def _chose(chosen: Round, hypothesis: Hypothesis) -> bool:
-    return chosen.accepted and chosen.chosen.key == hypothesis.key

@@ -91,4 +91,9 @@ class Round:
 
 def chosen_in(rounds: Sequence[Round], key: tuple[str, Place]) -> Round:
     """The last of the rounds that chose an effect: by then more of the others was known."""
-    return next(r for r in reversed(rounds) if r.accepted and r.chosen.key == key)
+    return last_rounds(rounds)[key]
+
+
+def last_rounds(rounds: Sequence[Round]) -> dict[tuple[str, Place], Round]:
+    """Of each effect that was chosen, the last of its rounds."""
+    return {r.chosen.key: r for r in rounds if r.accepted}

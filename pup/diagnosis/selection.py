@@ -143,12 +143,10 @@ class Selector:
         ]
         if len(classes[0]) == len(model.hypotheses):
             return [self.nominal.fit] * len(classes)
-        fits = self.without(model)
-        told = [fit if len(own) == 1 else None for fit, own in zip(fits, classes, strict=True)]
-        apart = {own[0]: own for own in classes if len(own) > 1}
-        fewer = {first: reduce(less, own, model.fit) for first, own in apart.items()}
+        fewer = {own[0]: reduce(less, own, model.fit) for own in classes if len(own) > 1}
         fit_together(list(fewer.values()), self.replays, self.noise, iterations=ROUGH)
-        return [fit or fewer[own[0]] for fit, own in zip(told, classes, strict=True)]
+        alone = self.without(model)
+        return [fewer.get(own[0], fit) for fit, own in zip(alone, classes, strict=True)]
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
