@@ -203,7 +203,8 @@ def test_seeds_are_counted_before_they_are_made(
 
 
 IN_VAIN: dict[str, tuple[dict[str, object], str]] = {
-    "unknown": ({"motions": ("step", "jump:2")}, "record: motions: 'jump' is none of step, "),
+    "unknown": ({"motions": ("step", "jump:2")}, "record: motions: motion 'jump:2': robot"),
+    "variant": ({"motions": ("step:9",)}, "record: motions: motion 'step:9': after the colon"),
     "no type": ({"fitted": ("step:0.3",)}, "record: fitted: 'step:0.3' is none of step, "),
     "not played": ({"fitted": ("fall",)}, "record: no motion is of a type in fitted"),
 }

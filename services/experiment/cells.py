@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pup.errors import InputError
 from pup.files import sha256
 from pup.policy.bundle import CARD
@@ -98,19 +100,23 @@ class _Graph:
 
     def _check_motions(self, cells: Mapping[str, Cell]) -> None:
         """Refuse types of motion that nobody plays, or that a cell would look for in vain."""
-        from pup.sysid.excitation import possible_kinds
+        from pup.sysid.excitation import possible_kinds, script
 
         record, looked_at = self.plan.record, self.plan.diagnosis.motions
-        played, known = [m.partition(":")[0] for m in record.motions], possible_kinds(self.robot)
-        places = {"record: motions": played, "record: fitted": record.fitted}
-        for place, motions in (places | {"diagnosis: motions": looked_at}).items():
+        try:
+            scripts = script(self.robot, record.motions, np.random.default_rng(self.plan.seed))
+        except InputError as error:
+            raise InputError(f"record: motions: {error}") from error
+        played, known = {motion.motion for motion in scripts}, possible_kinds(self.robot)
+        places = {"record: fitted": record.fitted, "diagnosis: motions": looked_at}
+        for place, motions in places.items():
             if unknown := [motion for motion in motions if motion not in known]:
                 raise InputError(f"{place}: {unknown[0]!r} is none of {', '.join(known)}")
-        fitted = set(played).intersection(record.fitted or played)
+        fitted = played.intersection(record.fitted or played)
         stages = set(map(self._stage, cells.values()))
         if not fitted and "presysid" in stages:
             raise InputError("record: no motion is of a type in fitted, which pre-sysID is given")
-        if looked_at and "diagnosis" in stages and not set(played).intersection(looked_at):
+        if looked_at and "diagnosis" in stages and not played.intersection(looked_at):
             raise InputError("diagnosis: no motion of record is of a type in motions")
         if looked_at and "corrected" in stages and not fitted.intersection(looked_at):
             raise InputError(
