@@ -10,6 +10,7 @@ import pytest
 
 from pup.physics import kernels
 from pup.physics.implicit import implicit_share
+from pup.physics.terms.kernels import rub as rub_joints
 
 NOWHERE = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
 STEP = np.full((9, 1), 0.002)
@@ -55,7 +56,7 @@ def test_a_simulation_knows_neither_its_neighbours_nor_those_that_have_ended(joi
         torque, damping = np.zeros((2, active, joints))
         now = velocity[rows][:active]
         all_of_them = (a[rows] for a in fixed)
-        kernels.rub(torque, damping, bent, now, 1.1 * now, *all_of_them, STEP[rows])
+        rub_joints(torque, damping, bent, now, 1.1 * now, *all_of_them, STEP[rows])
         np.testing.assert_array_equal(bent[active:], bend[rows][active:])
         return torque, damping, bent[:active]
 

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.implicit import implicit_share
+from pup.physics.terms import kernels
 from pup.physics.terms.base import Drive, Flow, Quantity, Term, begin
 
 Array = NDArray[np.float64]
@@ -64,19 +65,21 @@ class ActuatorLag(Term):
 
         A part of it is what is asked for now, the rest what was, less the damping that is now.
         """
-        assert flow.law_damping is not None
-        n, damping = len(flow.torque), flow.law_damping
-        lagging, before, ahead = self._lagging[:n], self._asked[:n], self._ahead[:n]
-        asked = before + ahead * flow.velocity  # by the velocity that the last sub-step came to
-        lagging[:] = asked + self._kept[:n] * (lagging - asked)
-        implicit = implicit_share(damping, self.scene.inertia[:n], self.scene.timestep)
-        own = (1 - implicit) * damping * flow.velocity
-        before[:], ahead[:] = flow.torque + own, implicit * damping - flow.damping
-        # It stood; velocities begin half a sub-step before, which a limit does not see.
-        begin(lagging, np.where(flow.damping > 0, before, flow.torque))
-        now = np.where(self.values["time"][:n] > 0, self._share[:n], 1.0)
-        flow.torque[:] = now * flow.torque + (1 - now) * (lagging - own)
-        flow.damping[:] = now * flow.damping + (1 - now) * implicit * damping
+        law = flow.law_damping
+        assert law is not None
+        kernels.lag(
+            flow.torque,
+            flow.damping,
+            flow.velocity,
+            law,
+            implicit_share(law, self.scene.inertia[: len(law)], self.scene.timestep),
+            self.values["time"],
+            self._kept,
+            self._share,
+            self._lagging,
+            self._asked,
+            self._ahead,
+        )
 
 
 class VoltageSag(Term):
@@ -293,30 +296,19 @@ class TargetRateLimit(Term):
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term."""
-        n = len(now)
-        begin(self._goal[:n], before)
-        limited = self._limited[:n]
-        earlier = self._moved(before, self.scene.timestep * (1 - share))
-        later = self._moved(now, self.scene.timestep * share)
-        return np.where(limited, later, now), np.where(limited, earlier, before)
-
-    def _moved(self, target: Array, time: Array | float) -> Array:
-        """Move the goals towards targets for some time; their mean on the way."""
-        n = len(target)
-        goal, speed = self._goal[:n], self._speed[:n]
-        rate, acceleration = self._rate[:n], self._acceleration[:n]
-        away = target - goal
-        far, gained = np.abs(away), acceleration * time
-        wanted = np.copysign(np.minimum(rate, np.sqrt(2 * acceleration * far)), away)
-        fast = np.clip(wanted, speed - gained, speed + gained)
-        more = fast - speed
-        way = fast * time - more * np.abs(more) / (2 * acceleration)
-        there = (np.abs(way) >= far) & (way * away >= 0)
-        step = np.where(there, away, way)
-        took = np.where(there, far / np.maximum(np.abs(way), 1e-12), 1.0)
-        speed[:] = np.where(there, 0.0, fast)
-        goal += step
-        return np.asarray(goal - step * took / 2)
+        now, before = now.copy(), before.copy()
+        kernels.travel(
+            now,
+            before,
+            np.atleast_2d(share),
+            np.atleast_2d(self.scene.timestep),
+            self._rate,
+            self._acceleration,
+            self._limited,
+            self._goal,
+            self._speed,
+        )
+        return now, before
 
 
 class Cogging(Term):

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics import kernels
+from pup.physics.terms import kernels
 from pup.physics.terms.base import Flow, Quantity, Term
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics import kernels
 from pup.physics.implicit import implicit_share
+from pup.physics.terms import kernels
 from pup.physics.terms.base import Flow, Quantity, Scene, Term
 from pup.physics.writer import FieldWriter
 
