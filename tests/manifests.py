@@ -20,6 +20,8 @@ Document = dict[str, Any]
 ROOT = Path(__file__).parents[1]
 K8S = ROOT / "deploy/k8s"
 OVERLAYS = ("dev", "cluster", "gpu")
+KUBERAYS = {"app.kubernetes.io/name": "kuberay", "app.kubernetes.io/created-by": "kuberay-operator"}
+"""Labels that KubeRay gives all its Ray pods."""
 KUBERNETES = ("1.31", "1.37")
 """The oldest and the newest version that the manifests are for."""
 
@@ -110,7 +112,7 @@ def pods(documents: list[Document]) -> Iterator[Pod]:
 
 
 def _ray_pods(name: str, spec: Document) -> Iterator[Pod]:
-    common = {"ray.io/is-ray-node": "yes", "ray.io/cluster": name}
+    common = {"ray.io/is-ray-node": "yes", "ray.io/cluster": name} | KUBERAYS
     head = spec["headGroupSpec"]["template"]["spec"]
     scaler = {"name": "autoscaler", "image": head["containers"][0]["image"]}
     scaler |= spec["autoscalerOptions"]
@@ -124,8 +126,10 @@ def _ray_pods(name: str, spec: Document) -> Iterator[Pod]:
 def selects(selector: Document, labels: dict[str, str]) -> bool:
     """Whether a label selector takes something with these labels."""
     for rule in selector.get("matchExpressions", []):
-        assert rule["operator"] == "In"
-        if labels.get(rule["key"]) not in rule["values"]:
+        assert rule["operator"] in ("In", "DoesNotExist")
+        if rule["operator"] == "DoesNotExist" and rule["key"] in labels:
+            return False
+        if rule["operator"] == "In" and labels.get(rule["key"]) not in rule["values"]:
             return False
     return selector.get("matchLabels", {}).items() <= labels.items()
 

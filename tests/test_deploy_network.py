@@ -3,7 +3,7 @@
 import ipaddress
 
 import pytest
-from manifests import OVERLAYS, Document, jobs, one, overlay, pods, selects
+from manifests import KUBERAYS, OVERLAYS, Document, jobs, one, overlay, pods, selects
 
 from services.gateway.config import Config
 
@@ -47,6 +47,8 @@ DNS = End({"k8s-app": "kube-dns"}, {"kubernetes.io/metadata.name": "kube-system"
 OPERATOR = End({"app.kubernetes.io/name": "kuberay-operator"}, OUTSIDE)
 PROMETHEUS = End({"app.kubernetes.io/name": "prometheus"}, OUTSIDE)
 INGRESS = End({"app": "proxy"}, OUTSIDE | {"pup/ingress": "true"})
+KUSTOMIZED = End({"app.kubernetes.io/name": "kuberay"}, OUTSIDE)
+FOREIGN_RAY = End({"ray.io/is-ray-node": "yes", "ray.io/node-type": "worker"} | KUBERAYS, OUTSIDE)
 STRANGER = End({"app": "proxy"}, OUTSIDE)
 
 
@@ -105,7 +107,8 @@ def test_what_is_needed_is_let_through(name: str) -> None:
         assert may(name, worker, head, port) and may(name, head, worker, port)
     assert may(name, worker, worker, ANY)
     assert may(name, there["submitter"], there["job's head"], DASHBOARD)
-    assert may(name, OPERATOR, head, DASHBOARD)
+    for operator in (OPERATOR, KUSTOMIZED):
+        assert may(name, operator, head, DASHBOARD)
     assert may(name, head, INTERNET, 6443) and may(name, head, INTERNET, 443)  # API server
     for end in there.values():
         assert may(name, end, DNS, 53) and may(name, end, DNS, 53, "UDP")
@@ -123,8 +126,9 @@ def test_what_is_not_needed_is_not(name: str) -> None:
     assert not may(name, INTERNET, gateway, LINK)
     for port in (PAGES, LINK):
         assert not may(name, STRANGER, gateway, port)
-    for end in (ROBOT, INGRESS, STRANGER, PROMETHEUS):
-        assert not may(name, end, head, DASHBOARD)
+    for end in (ROBOT, INGRESS, STRANGER, PROMETHEUS, FOREIGN_RAY):
+        for port in (DASHBOARD, GCS):
+            assert not may(name, end, head, port)
         assert not may(name, end, worker, ANY)
     assert not may(name, gateway, head, GCS)
     assert not may(name, gateway, worker, ANY)
