@@ -3,13 +3,21 @@
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 from pathlib import Path
 from typing import Any
 
 from pup.errors import InputError
 
 JSON_LIMIT = 64 * 2**20  # bytes
+MISTAKES = (
+    FileNotFoundError,
+    PermissionError,
+    FileExistsError,
+    IsADirectoryError,
+    NotADirectoryError,
+)
+"""What a wrong path raises; any other OSError is trouble of the storage, which may pass."""
 
 
 def write_atomic(path: Path, data: bytes | str) -> None:
@@ -21,24 +29,16 @@ def write_atomic(path: Path, data: bytes | str) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     raw = data.encode() if isinstance(data, str) else data
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    with open(part, "xb") as file:  # unlike one of `tempfile` with the rights of any new file
+        try:
             file.write(raw)
             file.flush()
             os.fsync(file.fileno())
-            os.fchmod(file.fileno(), 0o666 & ~_umask())  # a temporary file is its owner's alone
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def _umask() -> int:
-    """The process's file creation mask; it can only be read by setting it."""
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -60,14 +60,15 @@ def read_json(path: Path, limit: int = JSON_LIMIT) -> Any:
 
     Raises:
       InputError: the file is absent, too large or no JSON.
+      OSError: the storage cannot be read now.
     """
     try:
         if path.stat().st_size > limit:
             raise InputError(f"{path}: larger than {limit} bytes; is this the right file?")
         return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
+    except MISTAKES as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except InputError:
+    except (InputError, OSError):
         raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a JSON document ({error})") from error

@@ -32,6 +32,7 @@ class Checkpoint:
 
     Raises:
       InputError: it is of another training, or no checkpoint.
+      OSError: it cannot be read now.
     """
 
     def __init__(self, file: Path, digest: str) -> None:
@@ -43,12 +44,13 @@ class Checkpoint:
             self._read()
 
     def _read(self) -> None:
+        raw = self.file.read_bytes()  # trouble of the storage is none of the file
         try:
-            with np.load(self.file, allow_pickle=False) as packed:
+            with np.load(io.BytesIO(raw), allow_pickle=False) as packed:
                 told = {name: packed[name] for name in packed.files}
             meta = json.loads(told.pop(META).tobytes())
             schema, digest = meta["schema"], meta["digest"]
-        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        except (EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
             raise InputError(f"{self.file}: not a checkpoint; use another --out") from error
         if (schema, digest) != (SCHEMA, self.digest):
             raise InputError(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pup.errors import InputError
+from pup.files import MISTAKES
 from services import stopping
 from services.arguments import parser
 from services.verbs import VERBS
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         print(f"pup {options.name}: {place}{error.strerror or error}", file=sys.stderr)
-        return REFUSED if error.filename else FAILED
+        return REFUSED if isinstance(error, MISTAKES) and error.filename else FAILED
     if options.json:
         print(json.dumps(shown, allow_nan=False))
     else:

@@ -170,6 +170,15 @@ def test_more_fits_than_run_at_once(runner: RayRunner, fits: list[Fit], tmp_path
     assert_same(runner.run(many, tmp_path / "ray", lambda _: None), local)
 
 
+def test_what_a_node_cannot_write_is_nobodys_input(
+    runner: RayRunner, fits: list[Fit], tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="on a node of the cluster") as caught:
+        runner.run(fits[1:2], tmp_path / "file", lambda _: None)
+    assert caught.value.filename is None  # by which `pup` tells bad input
+
+
 def test_what_is_wrong_with_an_input_is_told_as_such(
     runner: RayRunner, fits: list[Fit], tmp_path: Path
 ) -> None:

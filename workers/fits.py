@@ -139,8 +139,9 @@ class RayRunner:
                     )
                     running[run] = (i, actor)
                 for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
-                    i, actor = running.pop(reference)
+                    i, actor = running[reference]
                     results[i] = _result(reference)
+                    del running[reference]
                     self._idle.append(actor)
                     statuses[i] = _done(fits[i], results[i])
                 _poll(running.values(), fits, statuses)
@@ -156,13 +157,19 @@ def _actor() -> Any:
 
 
 def _result(reference: Any) -> FitResult:
-    """An actor's result; what went wrong in it is raised as it was there."""
+    """An actor's result; what went wrong in it is raised as it was there.
+
+    Raises:
+      OSError: without a file's name, for what a node cannot read or write is nobody's input.
+    """
     try:
         return ray.get(reference)
     except RayTaskError as error:
         cause: BaseException = error
         while isinstance(cause, RayTaskError) and cause.cause is not None:
             cause = cause.cause  # what a task raised comes wrapped once more by the actor
+        if isinstance(cause, OSError):
+            raise OSError(f"on a node of the cluster: {cause}") from error
         raise cause from error
 
 

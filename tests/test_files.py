@@ -1,0 +1,74 @@
+"""Files written whole, with the rights of any new file; what is wrong with one that is read."""
+
+import os
+import socket
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from commandline import pup
+
+from pup.errors import InputError
+from pup.files import read_json, write_atomic
+from services.checkpoint import Checkpoint
+
+
+@pytest.fixture
+def no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A path that exists, is nobody's mistake by its kind of error, and cannot be read."""
+    monkeypatch.chdir(tmp_path)  # a socket's path is short
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind("socket")
+    return tmp_path / "socket"
+
+
+def test_threads_that_write_leave_each_other_their_rights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, usual = os.umask(0o027), os.umask
+
+    def slow(mask: int) -> int:
+        told = usual(mask)
+        time.sleep(0.001)  # so that other threads come to their turn
+        return told
+
+    monkeypatch.setattr(os, "umask", slow)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(lambda i: write_atomic(tmp_path / f"{i}", b"x"), range(64)))
+        assert {file.stat().st_mode & 0o777 for file in tmp_path.iterdir()} == {0o640}
+        assert usual(0o027) == 0o027
+    finally:
+        usual(before)
+
+
+def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(IsADirectoryError):
+        write_atomic(tmp_path / "folder", b"x")
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+
+
+def test_trouble_of_the_storage_is_no_bad_input(no_file: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_json(no_file.with_name("absent"))
+    with pytest.raises(OSError, match="No such device"):
+        read_json(no_file)
+
+
+def test_a_checkpoint_that_cannot_be_read_now_is_kept(no_file: Path) -> None:
+    with pytest.raises(OSError, match="No such device"):
+        Checkpoint(no_file, "of something")
+
+
+def test_trouble_of_the_storage_ends_a_verb_with_another_code(
+    no_file: Path, bench_recordings: Path
+) -> None:
+    """A job is tried again after it, and not after bad input."""
+    given = ("replay", bench_recordings, "--robot", "servo_bench", "--out", no_file.parent / "out")
+    done = pup(*given, "--bounds", no_file)
+    assert (done.code, len(done.err.splitlines())) == (1, 1)
+    assert f"{no_file}: No such device" in done.err
+    done = pup(*given, "--bounds", no_file.with_name("absent"))
+    assert done.code == 2
