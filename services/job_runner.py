@@ -30,6 +30,8 @@ ASK_AGAIN = 5.0
 """Until a verb that did not end with us, as it does when Ray stops a job, is asked to, s."""
 PATIENCE = 20.0
 """For a verb that was asked to end, s."""
+SAFE = {"PYTHONSAFEPATH": "1"}
+"""Has a verb, and what it starts, import nothing from the shared storage, where it runs."""
 
 
 class Runner:
@@ -77,6 +79,7 @@ class Runner:
             child = subprocess.Popen(
                 [sys.executable, "-m", "services.cli", *command],
                 cwd=self.folder.shared,
+                env=os.environ | SAFE,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -112,7 +115,7 @@ class Runner:
         """Whether the attempt is still wanted, as far as is known."""
         try:
             order = self.folder.order()
-        except InputError:
+        except (InputError, OSError):
             return self.asked is None
         return self.asked is None and order.attempt == self.attempt and not order.stop
 

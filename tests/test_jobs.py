@@ -221,6 +221,12 @@ def test_a_process_runs_its_verb_once_and_says_how_it_ended(folder):
     assert "absent" in folder.outcome(2).told
 
 
+def test_a_file_in_the_shared_storage_is_no_library(folder):
+    (folder.shared / "random.py").write_text("raise SystemExit('a stranger')")
+    order(folder, 1, *map(str, replay(folder)))
+    assert runner(folder, 1).wait(120) == 0, folder.tail(4096)
+
+
 def wait_until(true, seconds=300.0):
     end = time.monotonic() + seconds
     while not true():
