@@ -214,7 +214,6 @@ def settings_of(options: Any) -> dict[str, Any]:
     names = ("trials", "initial", "least_gain", "repeats", "horizon", "lease", "failures", "agent")
     told = {n: getattr(options, n) for n in (*names, "seed") if getattr(options, n) is not None}
     told["gate"] = (Gate.AUTO if options.auto else Gate.OPERATOR).value
-    told.setdefault("failures", 3 if options.auto else 1)
     told["compare"] = [list(eta) for eta in options.compare]
     told["warm_start"] = not options.no_warm_start
     return told

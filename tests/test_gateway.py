@@ -90,6 +90,22 @@ def test_a_study_is_made_once_and_joined(service):
 
 
 @pytest.mark.parametrize(
+    ("told", "pauses_after"),
+    [({}, 1), ({"gate": "auto"}, 3), ({"failures": None}, 1), ({"gate": "auto", "failures": 5}, 5)],
+)
+def test_the_gate_tells_how_many_failures_pause_a_study(service, told, pauses_after):
+    """Whoever asks without `pup transfer` gets the same: an operator looks at each failure."""
+    named = {"name": "patient-" + "-".join(map(str, told.values())).lower() + "-"}
+    asked = {k: v for k, v in STUDY.items() if k != "gate"} | told | named
+    with service.client() as http:
+        assert http.post("/v1/studies", json=asked).status_code == 201
+        settings = http.get(f"/v1/studies/{named['name']}").json()["settings"]
+        assert settings["failures"] == pauses_after
+        again = http.post("/v1/studies", json=asked | {"failures": pauses_after})
+        assert again.status_code == 200, "the same study, told in full"
+
+
+@pytest.mark.parametrize(
     "wrong",
     [
         {"name": "../etc"},

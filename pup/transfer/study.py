@@ -16,6 +16,11 @@ class Gate(StrEnum):
     AUTO = "auto"
 
 
+FAILURES = {Gate.OPERATOR: 1, Gate.AUTO: 3}
+"""Trials in a row without a result before a study pauses, where nothing else is asked for: whoever
+releases each trial looks at each that failed."""
+
+
 class StudyState(StrEnum):
     """Whether a study makes trials."""
 

@@ -1,12 +1,19 @@
 """What requests and answers look like, for checks and for OpenAPI."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    model_validator,
+)
 
 from pup.errors import InputError
-from pup.transfer.study import Gate, StudyState
+from pup.transfer.study import FAILURES, Gate, StudyState
 from pup.transfer.study import StudySettings as Defaults
 from pup.transfer.trial import Purpose, TrialState
 from services.gateway.names import WHOLE
@@ -72,12 +79,22 @@ class NewStudy(Strict):
     compare: Annotated[list[Eta], Field(max_length=16)] = []
     horizon: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = Defaults.horizon
     lease: Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] = Defaults.lease
-    failures: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.failures
+    failures: Annotated[
+        Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] | None,
+        Field(description="Null or left out: 1 for the operator's gate, 3 for the automatic one."),
+    ] = None
     gate: Annotated[Gate, Field(strict=False)] = Defaults.gate
     agent: Name | None = None
     warm_start: bool = Defaults.warm_start
     seed: Annotated[int, Field(ge=0, lt=2**31), WITHOUT_FRACTION] = Defaults.seed
     simulated: SimulatedRollouts | None = None
+
+    @model_validator(mode="after")
+    def _filled(self) -> Self:
+        """The failures that the gate goes with, where none are told."""
+        if self.failures is None:
+            self.failures = FAILURES[self.gate]
+        return self
 
 
 class Retry(Strict):
