@@ -28,6 +28,7 @@ import torch
 from ray.rllib.algorithms.ppo import PPOConfig
 
 from benchmarks.paired import ROBOT, Report, in_turn, parser, ratio
+from pup.errors import how_to_install
 from pup.locomotion.settings import TaskSettings
 from pup.policy.losses import Samples, TorchMirror, losses
 from pup.policy.mirror import MirrorMap
@@ -83,7 +84,9 @@ def main() -> None:
         if find_spec("stable_baselines3"):
             rivals["sb3"] = _sb3(work)
         else:
-            report.say("Stable-Baselines3 is not installed and left out: pip install pup[bench]")
+            report.say(
+                f"Stable-Baselines3 is not installed and left out; {how_to_install('bench')}"
+            )
         costs = dict(zip(rivals, in_turn(list(rivals.values()), given.rounds), strict=True))
     for name, of_one in costs.items():
         rate = work.steps / np.median([c.wall for c in of_one])

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from pup.errors import InputError
+from pup.errors import InputError, how_to_install
 from pup.robot import RobotDescription
 from services import places
 
@@ -85,7 +85,7 @@ def _presysid(options: argparse.Namespace) -> dict[str, Any]:
 
 def _train(options: argparse.Namespace) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("gymnasium") is None:
-        raise InputError("training needs PyTorch and RLlib; install pup[learn]")
+        raise InputError(f"training needs PyTorch and RLlib; {how_to_install('learn')}")
     _quiet_torch()
     from services.progress import stages, trained
     from services.tracking import check
@@ -149,7 +149,7 @@ def _serve(options: argparse.Namespace) -> dict[str, Any]:
 def _service() -> None:
     wanted = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "botorch", "httpx")
     if missing := [name for name in wanted if find_spec(name) is None]:
-        raise InputError(f"the service needs {missing[0]}; install pup[service]")
+        raise InputError(f"the service needs {missing[0]}; {how_to_install('service')}")
 
 
 def _replay(options: argparse.Namespace) -> dict[str, Any]:
@@ -208,7 +208,8 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
 
     if options.rivals and find_spec("torch") is None:
         raise InputError(
-            "--rivals needs PyTorch, which is not installed; leave it out or install pup[learn]"
+            "--rivals needs PyTorch, which is not installed; leave it out or, "
+            f"{how_to_install('learn')}"
         )
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
@@ -300,7 +301,7 @@ def _experiment(options: argparse.Namespace) -> dict[str, Any]:
     _service()
     if find_spec("torch") is None or find_spec("gymnasium") is None:
         raise InputError(
-            "the experiment trains policies with PyTorch and RLlib; install pup[learn]"
+            f"the experiment trains policies with PyTorch and RLlib; {how_to_install('learn')}"
         )
     from services.experiment import verb
 

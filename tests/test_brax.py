@@ -81,7 +81,11 @@ def test_an_engine_that_is_not_installed_is_refused(
         *("replay", tmp_path / "r1.parquet", "--robot", "servo_bench"),
         *("--engine", "brax", "--out", tmp_path / "out"),
     )
-    assert told.code == 2 and "pup[brax]" in told.err and len(told.err.splitlines()) == 1
+    assert (
+        told.code == 2
+        and "constraints.txt '.[brax]'" in told.err
+        and len(told.err.splitlines()) == 1
+    )
     assert not list((tmp_path / "out").glob("*"))
 
 

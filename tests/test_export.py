@@ -319,5 +319,5 @@ def test_without_rerun_a_line_says_what_to_install(
     monkeypatch.setattr(exporters, "find_spec", lambda name: None)
     done = pup("export", "rrd", leg_recordings, "--out", tmp_path / "out")
     assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "pup[export]" in done.err
+    assert "constraints.txt '.[export]'" in done.err
     assert pup("export", "mcap", leg_recordings, "--out", tmp_path / "out").code == 0

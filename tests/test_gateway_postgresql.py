@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
-pytest.importorskip("psycopg", reason="PostgreSQL: pip install 'pup[postgresql]'")
+pytest.importorskip("psycopg", reason="PostgreSQL: pip install -c constraints.txt '.[postgresql]'")
 
 import fake_agent
 import gateways

@@ -231,7 +231,11 @@ def test_without_pytorch_it_is_refused_at_once(
     done = pup("diagnose", tmp_path / "runs", "--robot", "servo_bench", "--local", "--rivals",
                "--out", tmp_path / "out")  # fmt: skip
     assert done.code == 2
-    assert "--rivals" in done.err and "PyTorch" in done.err and "pup[learn]" in done.err
+    assert (
+        "--rivals" in done.err
+        and "PyTorch" in done.err
+        and "constraints.txt '.[learn]'" in done.err
+    )
     assert not (tmp_path / "out").exists()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pup.errors import InputError
+from pup.errors import InputError, how_to_install
 from pup.exporters.common import Take
 from pup.robot import RobotDescription
 
@@ -25,7 +25,7 @@ def require(format: str, rate: int | None = None) -> None:
     if format not in FORMATS:
         raise InputError(f"format {format!r} is unknown; use one of {', '.join(FORMATS)}")
     if format == "rrd" and find_spec("rerun") is None:
-        raise InputError("rrd files need rerun-sdk; install pup[export]")
+        raise InputError(f"rrd files need rerun-sdk; {how_to_install('export')}")
     if format != "lerobot" and rate is not None:
         raise InputError(f"--fps: {format} keeps the times of a recording; only lerobot needs it")
 

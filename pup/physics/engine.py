@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from enum import StrEnum
 from importlib.util import find_spec
 
-from pup.errors import InputError
+from pup.errors import InputError, how_to_install
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.simulator import Simulator
 from pup.recording import Recording
@@ -24,7 +24,7 @@ class Engine(StrEnum):
           InputError: it is not.
         """
         if self is Engine.BRAX and (find_spec("jax") is None or find_spec("brax") is None):
-            raise InputError("the brax engine needs JAX and Brax; install pup[brax]")
+            raise InputError(f"the brax engine needs JAX and Brax; {how_to_install('brax')}")
 
 
 def make_simulator(
