@@ -240,6 +240,20 @@ def from_columns(metadata: object, columns: Mapping[str, Array]) -> Recording:
     )
 
 
+def _in_folder(folder: Path) -> list[Path]:
+    """Recordings of a folder; those of its own folders are not left out in silence."""
+    found = sorted(folder.glob("*.parquet"))
+    if found and (other := next(folder.glob("*/*.parquet"), None)):
+        raise InputError(
+            f"{folder}: {other.parent.name} in it holds recordings too; move them up, or elsewhere"
+        )
+    if not found and (other := next(folder.rglob("*.parquet"), None)):
+        raise InputError(f"{folder}: no *.parquet in this folder, but in {other.parent}; name that")
+    if not found:
+        raise InputError(f"{folder}: no *.parquet in this folder; see `pup import`")
+    return found
+
+
 def load_recordings(
     paths: Sequence[Path], robot: RobotDescription | None = None
 ) -> tuple[Recording, ...]:
@@ -250,15 +264,12 @@ def load_recordings(
       robot: when given, every recording must be one that this robot can replay.
 
     Raises:
-      InputError: nothing found, an id stands twice, or a recording breaks a rule; the message names
-        the file.
+      InputError: nothing found, a folder's own folders hold some, an id stands twice, or a
+        recording breaks a rule; the message names the file.
     """
     files: list[Path] = []
     for path in map(Path, paths):
-        found = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
-        if not found:
-            raise InputError(f"{path}: no *.parquet in this folder; see `pup import`")
-        files += found
+        files += _in_folder(path) if path.is_dir() else [path]
     if not files:
         raise InputError("no recording given; name Parquet files or folders of them")
     origin: dict[str, Path] = {}

@@ -163,6 +163,19 @@ def _(place: Place) -> Made:
     return ["run", "--recordings", empty, "--out", place.out, *TINY], (empty, "pup import")
 
 
+@case("a folder whose recordings are deeper")
+def _(place: Place) -> Made:
+    shutil.copytree(place.bench, inner := place.here / "outer" / "a" / "inner")
+    return place.replay(place.here / "outer"), (f"but in {inner}",)
+
+
+@case("a folder with recordings in a folder of its own too")
+def _(place: Place) -> Made:
+    for copy in ("outer", "outer/inner"):  # as `cp` does the second time
+        shutil.copytree(place.bench, place.here / copy)
+    return place.replay(place.here / "outer"), (place.here / "outer", "inner in it")
+
+
 @case("a folder that is not there")
 def _(place: Place) -> Made:
     return place.replay(place.here / "nowhere"), (place.here / "nowhere", "No such file")

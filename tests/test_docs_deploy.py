@@ -32,6 +32,13 @@ def test_commands_of_pup_are_taken() -> None:
     assert checked == 6
 
 
+def test_recordings_are_copied_to_the_same_place_again_and_again() -> None:
+    """Of a folder itself the second copy would stand inside the first one; kubectl's always so."""
+    assert "kubectl cp" not in TEXT.replace("-n pup ", "")
+    copied = [words for words in commands() if words[:2] == ["docker", "compose"] and "cp" in words]
+    assert copied and all(words[words.index("cp") + 1].endswith("/.") for words in copied)
+
+
 def test_files_that_are_named_are_there() -> None:
     named = {word for words in commands() for word in words if word.startswith("deploy/")}
     assert len(named) >= 7
