@@ -54,7 +54,7 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
     """
     from pup.blind.score import score_set
     from pup.blind.table import markdown
-    from services.blind_oracle import Oracle
+    from services.blind_oracle import replayed
     from services.blind_run import cases_of
 
     table = options.out.with_suffix(".md")
@@ -64,10 +64,9 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
     if journal and any(journal["set"].get(name) != commitment.get(name) for name in SAME_SET):
         raise InputError(f"{options.diagnoses / JOURNAL}: tells of a run over another set")
     with counted("blind score") as tell:
-        oracle = Oracle(options.set, options.diagnoses, tell)
         first = [c.name.removeprefix("case_") for c in cases_of(options.set, options.limit)]
         only = None if options.limit is None else first
-        scores = score_set(options.set, options.key, options.diagnoses, oracle, only)
+        scores = score_set(options.set, options.key, options.diagnoses, replayed, only, tell)
     scores["engine"] = journal["engine"] if journal else None
     write_json(options.out, scores)
     page = markdown(scores)

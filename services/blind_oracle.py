@@ -1,6 +1,6 @@
 """How well diagnoses predict motions that they were never given."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,30 +18,8 @@ LAW = "pd"
 """Torque law of the nominal model (CONTRACTS.md, section 2)."""
 
 
-class Oracle:
-    """Replays diagnoses of a blind set, and tells how many are done.
-
-    Args:
-      folder: the set.
-      diagnoses: its diagnoses.
-      tell: see `progress.counted`.
-    """
-
-    def __init__(self, folder: Path, diagnoses: Path, tell: Callable[..., None]) -> None:
-        tests = (path.parent.name for path in folder.glob("case_*/test"))
-        self.total = sum((diagnoses / case / CORRECTED).is_dir() for case in tests)
-        self.done, self.tell = 0, tell
-
-    def __call__(self, diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:
-        """See `score.Replay`."""
-        told = replayed(diagnosed, tests)
-        self.done += 1
-        self.tell(self.done, self.total, share=self.done / self.total)
-        return told
-
-
 def replayed(diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:
-    """Replay the refitted nominal model and the corrected robot of a diagnosis.
+    """Replay the refitted nominal model and the corrected robot of a diagnosis: a `score.Replay`.
 
     Args:
       diagnosed: the diagnosis's folder.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pup.blind.table import NULL_ROWS, ROWS, cell, few
+from pup.blind.table import CLAIM_ROWS, NULL_ROWS, ROWS, cell, few
 
 COSTS = {
     "gain": "held-out error less by, median",
@@ -65,10 +65,14 @@ def page(cases: Sequence[str], methods: Mapping[str, Mapping[str, Any]]) -> str:
         ),
         "",
     ]
-    for what, rows, group in (("omissions", ROWS, "all"), ("nulls", NULL_ROWS, "nulls")):
+    for what, rows, group in (
+        ("omissions", ROWS, "all"),
+        ("nulls", NULL_ROWS, "nulls"),
+        ("all claims", CLAIM_ROWS, None),
+    ):
         lines += [f"| {what} | {titles} |", "|---" * (len(methods) + 1) + "|"]
         for name, told in rows.items():
-            cells = [cell(scores[group][name]) for scores in methods.values()]
+            cells = [cell((s[group] if group else s)[name]) for s in methods.values()]
             lines.append(f"| {told} | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)

@@ -25,6 +25,7 @@ COARSE = 10  # joints from which sensitivities take a coarser step
 FURTHEST = (-0.8, 3.0)  # relative changes of parameters in a refit
 STRIDE = 0.5  # largest relative change of a parameter in one step
 LOUD = 2.0  # sigma, from which a reading counts as off
+FAINT = 4.0  # least SNR at which an effect counts as there
 MATERIAL = 0.3  # of sigma, the held-out gain from which an omission matters
 
 
@@ -40,6 +41,8 @@ class Visibility:
       held_out: as `left`, on the training or the test motions, whichever show more, in units of
         sigma: the engine may leave out any of the former, the scorer keeps the latter.
       held_out_all: the same over all joints.
+      tested: rms over all joints of what a refit leaves of the test motions, rad; None where there
+        are none.
       absorbed_by: relative change of each nominal parameter.
       when: spans of the recordings in which a refit leaves more than noise.
     """
@@ -50,6 +53,7 @@ class Visibility:
     absorbed: float
     held_out: float
     held_out_all: float
+    tested: float | None
     absorbed_by: Mapping[str, float]
     when: Sequence[Mapping[str, Any]]
 
@@ -63,6 +67,7 @@ class Visibility:
         return {
             "raw_rms_rad": self.raw,
             "after_refit_rms_rad": self.left,
+            "after_refit_test_rms_rad": self.tested,
             "snr": self.snr,
             "absorbed": self.absorbed,
             "held_out_gain_sigma": self.gain,
@@ -165,16 +170,19 @@ class Reference:
         left = self._left(train, wanted, model, noise, train)
         norm, joints = float(np.linalg.norm(rest)), len(self.world.robot.joints)
         apart = [_rms(left, columns, joints)]
+        tested = None
         if test:
             missed = self._left(train, wanted, model, noise, test)
             apart.append(_rms(missed, self._weighed(test, wanted, model, noise)[2], joints))
+            tested = _root_mean_square(apart[-1]) * noise.sigma
         return Visibility(
             raw=float(_rms(rest, columns, joints).max()) * noise.sigma,
             left=float(apart[0].max()) * noise.sigma,
             snr=float(np.linalg.norm(left)),
             absorbed=1.0 - float(np.linalg.norm(left)) / norm if norm else 0.0,
             held_out=float(np.max(apart)),
-            held_out_all=max(float(np.sqrt((rms**2).mean())) for rms in apart),
+            held_out_all=max(map(_root_mean_square, apart)),
+            tested=tested,
             absorbed_by={n: float(c) for n, c in zip(self.values, change, strict=True)},
             when=self._spans(train, wanted, model, noise),
         )
@@ -281,6 +289,11 @@ def _weights(seen: Seen, noise: Noise) -> tuple[Array, Indices]:
     weight = [1 / noise.sigma] * joints + [1 / noise.imu] * tilts
     columns = [*range(joints), *([-1] * tilts)]
     return np.tile(weight, ticks), np.tile(columns, ticks)
+
+
+def _root_mean_square(rms: Array) -> float:
+    """Root mean square over joints of as many readings each."""
+    return float(np.sqrt(np.mean(rms**2)))
 
 
 def _rms(values: Array, columns: Indices, joints: int) -> Array:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pup.blind.absorb import MATERIAL, Reference, Visibility, readings
+from pup.blind.absorb import FAINT, MATERIAL, Reference, Visibility, readings
 from pup.blind.catalogue import COMPARABLE, KINDS
 from pup.blind.drafts import Draft, draw_case, draw_null
 from pup.blind.sensors import Noise, measure
@@ -27,7 +27,6 @@ STRATA = {
 }
 NULLS = {"noise": 0.24, "parameters": 0.2, "coloured": 0.2, "engine": 0.2, "nuisance": 0.16}
 
-FAINT = 4.0  # least SNR at which an effect counts as there
 CLEAR = 10.0  # SNR from which an effect below the noise is detectable without doubt
 HIDDEN = 0.5  # share absorbed from which an effect counts as masked
 ROUNDS = 2  # of a refit that is measured

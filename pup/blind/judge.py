@@ -1,21 +1,23 @@
 """What one diagnosis got right of one case."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from itertools import product
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from pup.blind.absorb import FAINT
 from pup.blind.catalogue import CLASS_OF
+from pup.blind.places import covered, credit
 from pup.robot import RobotDescription
 
-SHARP = 0.8  # probability from which a single name counts as a sharp claim
+SHARP = 0.8  # share of a finding's probability from which a name counts as a sharp claim
+STATED = 0.5  # probability from which `unknown` counts though something else stands first
 PER_SECOND = 100  # resolution in which spans of time are compared
-WHOLE = ("bus", "robot")  # places that cover all joints
 CALM = "null:nuisance"  # the nulls that have a nuisance
 UNKNOWN = "unknown"  # what a finding outside the list is called
+OWN_LINES = ("weak", "unidentifiable")  # strata in which little to be gained is the rule
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,14 @@ class Named:
       place: as in the document.
       probability: of it.
       finding: index of the finding it belongs to.
+      outside: whether it is told to be outside the list, by name or by a law.
     """
 
     effect: str
     place: Mapping[str, Any]
     probability: float
     finding: int
+    outside: bool
 
 
 @dataclass(frozen=True)
@@ -45,17 +49,21 @@ class Judged:
       stratum: of the case.
       null: whether nothing is missing.
       excused: whether it is a null whose nuisance is material.
+      visible: whether it is a null whose nuisance is not, yet clear enough to be detected.
+      immaterial: whether what is missing gains too little on held-out motions to be material.
+      absorbed: share of what is missing that a refit hides.
       nuisance: what a complete model of a null's nuisance gains, in units of sigma.
       verdict: the diagnosis's, or `missing`.
       exact: rank of the first right effect, from 1.
       kind: rank of the first right class, from 1.
-      all_found: whether every effect's class stands among the first three.
-      place: credit for the place that is named first, 0 to 1.
+      all_found: whether every effect's class stands among the first three, each in a finding of
+        its own.
+      place: credit for the place that is named first, 0 to 1; None on a robot of one joint.
       background: whether what stands first is a nuisance that is there, by class and place.
       place_background: as `place`, such a nuisance's place counted as right.
       covered: whether the first finding and its equivalents hold the truth.
       size: how many effects those are.
-      sharp: whether a single effect is claimed with confidence.
+      sharp: whether the first finding is all but a single effect.
       allowed: whether the verdict is one that the data allow.
       unknown: whether something outside the list is told of.
       confidence: probability of the class named first.
@@ -75,6 +83,9 @@ class Judged:
     null: bool
     excused: bool
     verdict: str
+    visible: bool = False
+    immaterial: bool = False
+    absorbed: float | None = None
     nuisance: float | None = None
     exact: int | None = None
     kind: int | None = None
@@ -98,7 +109,7 @@ class Judged:
     named: tuple[str, ...] = field(default=())
 
 
-def ranking(diagnosis: Mapping[str, Any]) -> list[Named]:
+def ranking(findings: Sequence[Mapping[str, Any]]) -> list[Named]:
     """Findings and their equivalents: what is claimed first, then all others by probability.
 
     First is the first finding, for findings stand most important first (contract, section 5); a
@@ -107,10 +118,16 @@ def ranking(diagnosis: Mapping[str, Any]) -> list[Named]:
     """
     groups = [
         [
-            Named(str(e["effect"]), e["place"], float(e["probability"]), index)
+            Named(
+                str(e["effect"]),
+                e["place"],
+                float(e["probability"]),
+                index,
+                e["effect"] == UNKNOWN or bool(e.get("law")),
+            )
             for e in (finding, *finding.get("equivalents", []))
         ]
-        for index, finding in enumerate(diagnosis.get("findings", []))
+        for index, finding in enumerate(findings)
     ]
     if not groups:
         return []
@@ -126,66 +143,78 @@ def judge(
     diagnosis: Mapping[str, Any] | None,
     robot: RobotDescription,
     oracle: float | None = None,
+    repeats: Collection[str] = (),
 ) -> Judged:
-    """Judge one diagnosis.
+    """Judge one diagnosis. Findings count where its verdict is a mismatch.
 
     Args:
       truth: the case's entry in the key.
       diagnosis: its document; None where there is none.
       robot: of the case.
       oracle: share of the possible gain on the test motions that was had.
+      repeats: ids of its recordings that repeat another.
     """
-    null = str(truth["stratum"]).startswith("null:")
-    seen = truth.get("all_seen") or {}
+    document = diagnosis or {"verdict": "missing"}
+    verdict = str(document["verdict"])
+    findings = document.get("findings", []) if verdict == "mismatch" else []
+    named = ranking(findings)
+    group = _group(findings)
+    background = _background(robot, named, truth.get("nuisance", []))
+    stood = _stood(truth)
     case: dict[str, Any] = {
         "id": truth["id"],
         "robot": truth["robot"],
         "stratum": truth["stratum"],
-        "null": null,
-        "excused": null and bool(seen.get("material")),
-        "nuisance": seen.get("held_out_gain_sigma") if truth["stratum"] == CALM else None,
-    }
-    if diagnosis is None:
-        return Judged(**case, verdict="missing")
-    named = ranking(diagnosis)
-    findings = diagnosis.get("findings", [])
-    group = _group(findings)
-    verdict = str(diagnosis.get("verdict"))
-    background = _background(robot, named, truth.get("nuisance", []))
-    case |= {
+        **stood,
         "verdict": verdict,
         "size": len(group) or None,
-        "sharp": len(group) == 1 and max(n.probability for n in named) >= SHARP,
-        "allowed": verdict in truth["answer"]["verdicts"],
-        "unknown": any(n.effect == UNKNOWN for n in named) or any(f.get("law") for f in findings),
+        "sharp": _sharp(document.get("findings", [])),
+        "allowed": verdict in truth["answer"]["verdicts"] or stood["immaterial"],
+        "unknown": any(n.outside and (n is named[0] or n.probability >= STATED) for n in named),
         "confidence": _confidence(named),
         "background": bool(background),
         "ambiguous": verdict == "undetermined" or len(group) > 1,
-        "next": diagnosis.get("next_recording") is not None,
-        "seconds": _seconds(diagnosis),
+        "next": document.get("next_recording") is not None,
+        "seconds": _seconds(document),
         "oracle": oracle,
         "named": tuple(dict.fromkeys(n.effect for n in named))[:3],
     }
-    if null:
+    if stood["null"]:
         return Judged(**case)
     effects = truth["effects"]
     wanted = {str(e["effect"]) for e in effects}
     accepted = wanted | {b for e in effects for b in e["besides"]}
     classes = {CLASS_OF[e] for e in accepted if e in CLASS_OF}
-    kinds = [_class(n.effect) for n in named]
-    first = list(dict.fromkeys(kinds))[:3]
     answers = set(truth["answer"]["set"])
     case |= {
         "exact": _rank([n.effect for n in named], wanted),
-        "kind": _rank(kinds, classes or wanted),
-        "all_found": all(_classes_of(e) & set(first) for e in effects),
+        "kind": _rank([_class(n.effect) for n in named], classes or wanted),
+        "all_found": _all_found(named, effects),
         "place": _placed(robot, named, effects),
         "place_background": _placed(robot, named, [*effects, *background]),
         "covered": answers <= group if answers and group else bool(group & accepted),
-        "regime": _regime(truth, findings),
+        "regime": _regime(truth, findings, repeats),
     }
-    errors, inside = _parameters(effects, findings)
+    errors, inside = _parameters(robot, effects, findings)
     return Judged(**case, errors=errors, inside=inside)
+
+
+def _stood(truth: Mapping[str, Any]) -> dict[str, Any]:
+    """What is asked of a case, by what its effects or its nuisance do."""
+    stratum = str(truth["stratum"])
+    null = stratum.startswith("null:")
+    everything = truth.get("all_seen") or {}
+    alone = truth.get("effect_seen") or everything
+    excused = null and bool(everything.get("material"))
+    nuisance = everything if stratum == CALM else {}
+    return {
+        "null": null,
+        "excused": excused,
+        "visible": nuisance.get("snr", 0.0) >= FAINT and not excused,
+        "immaterial": not null and stratum not in OWN_LINES and alone.get("material") is False,
+        "absorbed": None if null else alone.get("absorbed"),
+        "nuisance": nuisance.get("held_out_gain_sigma"),
+    }
 
 
 def _group(findings: Sequence[Mapping[str, Any]]) -> set[str]:
@@ -193,6 +222,25 @@ def _group(findings: Sequence[Mapping[str, Any]]) -> set[str]:
     if not findings:
         return set()
     return {str(e["effect"]) for e in (findings[0], *findings[0].get("equivalents", []))}
+
+
+def _sharp(findings: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether one effect has nearly all of the first finding's probability."""
+    mass: dict[str, float] = {}
+    for finding in findings[:1]:
+        for one in (finding, *finding.get("equivalents", [])):
+            mass[one["effect"]] = mass.get(one["effect"], 0.0) + float(one["probability"])
+    return bool(mass) and max(mass.values()) >= SHARP * sum(mass.values())
+
+
+def _all_found(named: Sequence[Named], effects: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether each effect has a finding of its own, by classes that stand among the first three."""
+    first = list(dict.fromkeys(_class(n.effect) for n in named))[:3]
+    tellers = [
+        {n.finding for n in named if _class(n.effect) in _classes_of(effect).intersection(first)}
+        for effect in effects
+    ]
+    return any(len(set(choice)) == len(effects) for choice in product(*tellers))
 
 
 def _confidence(named: Sequence[Named]) -> float | None:
@@ -211,11 +259,11 @@ def _background(
     if not named:
         return []
     first = named[0]
-    told = _where(robot, first.place)
+    told = covered(robot, first.place)
     return [
         n
         for n in nuisance
-        if _class(n["effect"]) == _class(first.effect) and told & _where(robot, n["place"])
+        if _class(n["effect"]) == _class(first.effect) and told & covered(robot, n["place"])
     ]
 
 
@@ -226,7 +274,7 @@ def _rank(named: Sequence[str], right: set[str]) -> int | None:
 
 
 def _classes_of(effect: Mapping[str, Any]) -> set[str]:
-    return {_class(e) for e in (effect["effect"], *effect["besides"])}
+    return {_class(e) for e in (effect["effect"], *effect.get("besides", ()))}
 
 
 def _class(effect: str) -> str:
@@ -236,55 +284,26 @@ def _class(effect: str) -> str:
 
 def _placed(
     robot: RobotDescription, named: Sequence[Named], effects: Sequence[Mapping[str, Any]]
-) -> float:
-    """Credit for the place that is named first, by the effect that it fits best."""
-    return max((_credit(robot, n, e) for n in named[:1] for e in effects), default=0.0)
+) -> float | None:
+    """Credit for the place that is named first, by the effect of its class that it fits best.
+
+    None on a robot of one joint, where there is nothing to choose from.
+    """
+    if len(robot.joints) == 1:
+        return None
+    right = [(n, e) for n in named[:1] for e in effects if _class(n.effect) in _classes_of(e)]
+    return max((credit(robot, n.place, e["place"]) for n, e in right), default=0.0)
 
 
-def _credit(robot: RobotDescription, named: Named, effect: Mapping[str, Any]) -> float:
-    """1 for the place, half for its mirror, or for a group that holds it or that it holds."""
-    told, true = _where(robot, named.place), _where(robot, effect["place"])
-    if told == true:
-        return 1.0
-    mirrors = {joint.name: joint.mirror for joint in robot.joints}
-    if told == {mirrors.get(name) or name for name in true}:
-        return 0.5
-    nested = bool(told & true) and (told <= true or true <= told)
-    return 0.5 if nested and len(told) < len(robot.joints) else 0.0
+def _regime(
+    truth: Mapping[str, Any], findings: Sequence[Mapping[str, Any]], repeats: Collection[str]
+) -> float | None:
+    """F1 of the times at which the effects are told to act; None where nothing is told.
 
-
-def _where(robot: RobotDescription, place: Mapping[str, Any]) -> frozenset[str]:
-    """What a place covers: joints where it can be told in joints, else its kind and names."""
-    kind, names = str(place["kind"]), [str(n) for n in place["names"]]
-    if kind == "group":
-        return frozenset(j.name for j in robot.joints if j.group in names)
-    if kind in WHOLE:
-        return frozenset(robot.joint_names)
-    if kind in ("sensor", "ground"):
-        return frozenset((kind,))
-    if kind in ("body", "foot"):
-        return frozenset(_joint_of(robot).get(name, f"body {name}") for name in names)
-    return frozenset(names)
-
-
-@lru_cache(maxsize=8)
-def _joint_of(robot: RobotDescription) -> dict[str, str]:
-    """The joint that moves each body; bodies above all joints are left out."""
-    model = mujoco.MjSpec.from_file(str(robot.model_path)).compile()
-    found = {}
-    for body in range(1, model.nbody):
-        above = body
-        while above and not model.body_jntnum[above]:
-            above = model.body_parentid[above]
-        name = model.joint(model.body_jntadr[above]).name if above else ""
-        if name in robot.joint_names:
-            found[model.body(body).name] = name
-    return found
-
-
-def _regime(truth: Mapping[str, Any], findings: Sequence[Mapping[str, Any]]) -> float | None:
-    """F1 of the times at which the effects are told to act; None where nothing is told."""
-    told = _times([w for finding in findings for w in finding.get("when", [])])
+    Those in repeats are left out: the truth is of recordings that repeat no other.
+    """
+    every = [w for finding in findings for w in finding.get("when", [])]
+    told = _times([w for w in every if w["recording"] not in repeats])
     true = _times((truth.get("all_seen") or {}).get("when", []))
     if not told or not true:
         return None
@@ -300,14 +319,21 @@ def _times(spans: Sequence[Mapping[str, Any]]) -> set[tuple[str, int]]:
 
 
 def _parameters(
-    effects: Sequence[Mapping[str, Any]], findings: Sequence[Mapping[str, Any]]
+    robot: RobotDescription,
+    effects: Sequence[Mapping[str, Any]],
+    findings: Sequence[Mapping[str, Any]],
 ) -> tuple[tuple[float, ...], tuple[bool, ...]]:
-    """Relative errors and coverage where a finding has one parameter of the truth's unit."""
+    """Relative errors and coverage where a finding has one parameter of the truth's unit.
+
+    Of an effect elsewhere the size tells nothing: the places must meet.
+    """
     errors, inside = [], []
     for effect in effects:
-        size = effect["size"]
+        size, there = effect["size"], covered(robot, effect["place"])
         for finding in findings:
             if not effect["comparable"] or finding["effect"] != effect["effect"]:
+                continue
+            if not covered(robot, finding["place"]) & there:
                 continue
             same = [p for p in finding.get("parameters", {}).values() if p["unit"] == size["unit"]]
             if len(same) == 1:

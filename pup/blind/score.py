@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pup.blind.absorb import MATERIAL
 from pup.blind.judge import Judged, judge
 from pup.blind.seal import COMMITMENT, verify
@@ -14,7 +16,9 @@ from pup.files import read_json
 from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription
 
+DIAGNOSIS, CORRECTED = "diagnosis.json", "corrected"
 TOP = 3
+HEAVY = 0.85  # share of the rms that a refit hides, from which a masked case has a line besides
 THERE = " (a nuisance that is there)"
 
 
@@ -35,6 +39,9 @@ Replay = Callable[[Path, Sequence[Recording]], Replayed | None]
 """Replays the folder of a diagnosis, with its `corrected/`, on test recordings; None where the
 diagnosis does not tell the refitted nominal model."""
 
+Report = Callable[[int, int], None]
+"""Told how many cases are judged, and of how many."""
+
 
 def score_set(
     folder: Path,
@@ -42,6 +49,7 @@ def score_set(
     diagnoses: Path,
     replay: Replay | None = None,
     only: Collection[str] | None = None,
+    report: Report = lambda done, total: None,
 ) -> dict[str, Any]:
     """Score a set.
 
@@ -51,48 +59,48 @@ def score_set(
       diagnoses: folder with `case_<id>/diagnosis.json` for every case.
       replay: how to replay a corrected robot; without it there is no oracle ratio.
       only: ids of the cases to be scored; all of the set where None.
+      report: told after each case.
 
     Returns:
-      The scores, as JSON values. `all` and the robots' scores leave the stratum `weak` out, which
-      has a line of its own.
+      The scores, as JSON values. `all` and the robots' scores leave out the stratum `weak` and what
+      is immaterial; the former is among `per_stratum`, the latter among `lines`.
 
     Raises:
-      InputError: the key or the set is not the one committed to, or there is no diagnosis at all.
+      InputError: the key or the set is not the one committed to, or no diagnosis is of its cases.
     """
-    truths = [t for t in verify(folder, key)["cases"] if only is None or t["id"] in only]
-    if not any(diagnoses.glob("case_*/diagnosis.json")):
-        raise InputError(f"{diagnoses}: no case_<id>/diagnosis.json in it")
+    known = verify(folder, key)["cases"]
+    if not any((diagnoses / f"case_{t['id']}" / DIAGNOSIS).is_file() for t in known):
+        raise InputError(f"{diagnoses}: no case_<id>/{DIAGNOSIS} of a case of this set in it")
+    truths = [t for t in known if only is None or t["id"] in only]
     robots = {name: RobotDescription.load(name) for name in {t["robot"] for t in truths}}
     judged = []
     for truth in truths:
-        place = diagnoses / f"case_{truth['id']}"
-        document = _diagnosis(place / "diagnosis.json")
-        robot = robots[truth["robot"]]
-        oracle = None
-        if document is not None and replay is not None:
-            oracle = _oracle(truth, folder / f"case_{truth['id']}" / "test", place, replay)
-        try:
-            judged.append(judge(truth, document, robot, oracle))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{place / 'diagnosis.json'}: does not follow the contract ({error!r})"
-            ) from error
+        name = f"case_{truth['id']}"
+        judged.append(
+            _judged(truth, folder / name, diagnoses / name, robots[truth["robot"]], replay)
+        )
+        report(len(judged), len(truths))
     real = [case for case in judged if not case.null]
-    strata = sorted({case.stratum for case in judged})
+    counted = [case for case in real if case.stratum != "weak" and not case.immaterial]
+    masked = [case for case in real if case.stratum == "masked"]
     return {
         "schema": 1,
         "commitment": read_json(folder / COMMITMENT),
         "cases": len(judged),
         "missing": sum(case.verdict == "missing" for case in judged),
-        "all": _omissions([case for case in real if case.stratum != "weak"]),
+        "all": _omissions(counted),
         "nulls": _nulls([case for case in judged if case.null]),
         "per_stratum": {
             stratum: _nulls(group) if stratum.startswith("null:") else _omissions(group)
-            for stratum in strata
+            for stratum in sorted({case.stratum for case in judged})
             if (group := [case for case in judged if case.stratum == stratum])
         },
+        "lines": {
+            "immaterial": _omissions([case for case in real if case.immaterial]),
+            "masked_85": _omissions([c for c in masked if (c.absorbed or 0.0) >= HEAVY]),
+        },
         "per_robot": {
-            name: _omissions([c for c in real if c.robot == name and c.stratum != "weak"])
+            name: _omissions([case for case in counted if case.robot == name])
             | {"nulls": _nulls([c for c in judged if c.null and c.robot == name])}
             for name in sorted(robots)
         },
@@ -101,11 +109,36 @@ def score_set(
     }
 
 
+def _judged(
+    truth: Mapping[str, Any],
+    case: Path,
+    diagnosed: Path,
+    robot: RobotDescription,
+    replay: Replay | None,
+) -> Judged:
+    """Judge the diagnosis in a folder."""
+    document = _diagnosis(diagnosed / DIAGNOSIS)
+    null = truth["stratum"].startswith("null:")
+    oracle = None if replay is None or null else _oracle(truth, case / "test", diagnosed, replay)
+    try:
+        return judge(truth, document, robot, oracle, _repeats(case / "recordings"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{diagnosed / DIAGNOSIS}: does not follow the contract ({error!r})"
+        ) from error
+
+
+def _repeats(recordings: Path) -> set[str]:
+    """Recordings that repeat another."""
+    known = load_recordings([recordings]) if recordings.is_dir() else ()
+    return {recording.id for recording in known if recording.repeat_of is not None}
+
+
 def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
     """The scores of cases in which something is missing."""
     listed = [c for c in cases if c.stratum not in ("unlisted", "unidentifiable")]
     open_ = [c for c in cases if c.stratum == "unidentifiable"]
-    grouped = [c for c in cases if c.size is not None]
+    grouped = [*listed, *(c for c in open_ if c.size is not None)]
     unclear = [c for c in cases if c.ambiguous]
     return {
         "detected": share([c.verdict == "mismatch" for c in cases if c not in open_]),
@@ -136,12 +169,15 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
 
 def _nulls(cases: Sequence[Judged]) -> dict[str, Any]:
     """The scores of cases in which nothing material is missing."""
-    counted = [c for c in cases if not c.excused]
+    there = [c for c in cases if c.verdict != "missing"]
+    counted = [c for c in there if not c.excused and not c.visible]
     return {
         "false_positives": share([c.verdict == "mismatch" for c in counted]),
         "told_none": share([c.verdict == "none" for c in counted]),
         "undetermined": share([c.verdict == "undetermined" for c in counted]),
-        "material_nuisance": share([c.verdict == "mismatch" for c in cases if c.excused]),
+        "visible_nuisance": share([c.verdict == "mismatch" for c in there if c.visible]),
+        "material_nuisance": share([c.verdict == "mismatch" for c in there if c.excused]),
+        "missing": share([c.verdict == "missing" for c in cases]),
         "seconds": mean([c.seconds for c in cases if c.seconds is not None]),
     }
 
@@ -170,7 +206,8 @@ def _faults(case: Judged) -> list[str]:
     if case.verdict == "missing":
         return ["no diagnosis"]
     if case.null:
-        return [_alarm(case)] if case.verdict == "mismatch" and not case.excused else []
+        called = case.verdict == "mismatch" and not case.excused and not case.visible
+        return [_alarm(case)] if called else []
     if case.stratum == "unidentifiable":
         faults = [] if case.allowed else [f"verdict {case.verdict}"]
         return faults + ["sharp name where the data cannot tell"] * case.sharp
@@ -183,7 +220,8 @@ def _faults(case: Judged) -> list[str]:
         faults.append("wrong effect of the class")
     if case.stratum == "pair" and not case.all_found:
         faults.append("one of two found")
-    return faults + ["wrong place"] * (case.place is not None and case.place < 1)
+    wrong = case.kind == 1 and case.place is not None and case.place < 1
+    return faults + ["wrong place"] * wrong
 
 
 def _alarm(case: Judged) -> str:
@@ -214,13 +252,27 @@ def _diagnosis(path: Path) -> dict[str, Any] | None:
 
 
 def _oracle(truth: Mapping[str, Any], tests: Path, diagnosed: Path, replay: Replay) -> float | None:
-    """Share of the possible gain on test motions; None where there is next to none to be had."""
-    if not tests.is_dir() or not (diagnosed / "corrected").is_dir():
-        return None
-    errors = replay(diagnosed, load_recordings([tests]))
-    if errors is None:
+    """Share of the possible gain on test motions; None where there is next to none to be had.
+
+    Who tells no model has none of it. What a refit leaves stands in the key; for keys of earlier
+    sets it is what the diagnosis's own nominal model leaves.
+    """
+    if not tests.is_dir():
         return None
     # Who knows the form and refits everything is left with the noise.
-    best = float(truth["noise"]["sigma"])
-    possible = errors.nominal - best
-    return (errors.nominal - errors.corrected) / possible if possible > MATERIAL * best else None
+    best, seen = float(truth["noise"]["sigma"]), truth.get("all_seen") or {}
+    left = seen.get("after_refit_test_rms_rad")
+    nominal = None if left is None else float(np.hypot(best, left))
+    if nominal is not None and not _worth(nominal, best):
+        return None
+    there = (diagnosed / DIAGNOSIS).is_file() and (diagnosed / CORRECTED).is_dir()
+    errors = replay(diagnosed, load_recordings([tests])) if there else None
+    if errors is None:
+        return 0.0 if nominal is not None or seen.get("material") else None
+    nominal = errors.nominal if nominal is None else nominal
+    return (nominal - errors.corrected) / (nominal - best) if _worth(nominal, best) else None
+
+
+def _worth(nominal: float, best: float) -> bool:
+    """Whether there is enough to be gained for a share of it to mean something."""
+    return nominal - best > MATERIAL * best
