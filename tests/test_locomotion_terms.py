@@ -89,7 +89,7 @@ def both_ways(
     state = ours.state() | {"physics": begun.batch.state.copy()}
     link = begun.qpos[:, begun.group.model.qpos], begun.qvel[:, begun.group.model.dofs]
     sensed = begun.servos.sense(link[0].copy(), link[1].copy())
-    state |= {"before": link[1].copy(), "velocity": sensed[1].copy()}
+    state |= {"before": sensed[1].copy(), "velocity": sensed[1].copy()}
     state |= {"sensed_position": sensed[0].copy(), "sensed_velocity": sensed[1].copy()}
     state |= {
         f"{t.effect}/{name.strip('_')}": getattr(t, name) for t in begun.terms for name in t.state

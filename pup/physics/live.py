@@ -122,7 +122,7 @@ class LiveServos:
         if servos.delay is not None:
             servos.delay[rows] = candidates[DELAY][:, None]
         assert servos.before is not None
-        servos.before[rows] = link[1]
+        servos.before[rows] = velocity
         self.commands.renew(rows, np.asarray(scene.timestep))
         self.steps[rows] = 0
         self.position[rows], self.velocity[rows] = position, velocity

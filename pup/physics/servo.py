@@ -106,11 +106,11 @@ class Servos:
             term.settle(error, torque - damping * sensed[1])
         brake, viscous = self.limited.split(torque, damping, sensed[1], still)
         if self.flowing:
-            now = link[1]
+            now = sensed[1]
             before = now if self.before is None else self.before[: len(now)]
             self.before = now.copy()
             coming = 2 * now - before
-            flow = Flow(time, *link, coming, own, torque, damping, brake, viscous)
+            flow = Flow(time, *link, now, coming, own, torque, damping, brake, viscous)
             for term in self.flowing:
                 term.flow(flow)
         return torque - brake, damping + viscous

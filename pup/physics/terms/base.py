@@ -119,20 +119,26 @@ class Drive:
 class Flow:
     """A torque on its way from the servo to the link; arrays of shape (n_active, n_joints).
 
+    What it moves is the motor at first, and the link from where motors of their own engage it.
+
     Attributes:
       time: since the recording's start, s; or since each simulation's own, shape (n_active, 1).
       position: of the link, rad.
-      velocity: of the link, rad/s.
+      link: its velocity, rad/s.
+      velocity: of what the torque moves, rad/s.
       coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
       law_damping: the law's damping off its torque limit, N m s/rad; only where a term asks.
       torque: applied as it is, N m.
       damping: applied times the velocity at the sub-step's end, N m s/rad.
       brake: against the torque, by damping outside the servo, N m.
       viscous: the part of that damping applied times the velocity at the end, N m s/rad.
+      motor: torque of motors of their own and against the joints' damping, N m; NaN where a link
+        has none, None where no link has.
     """
 
     time: float | Array
     position: Array
+    link: Array
     velocity: Array
     coming: Array
     law_damping: Array | None
@@ -140,15 +146,11 @@ class Flow:
     damping: Array
     brake: Array
     viscous: Array
+    motor: Array | None = None
 
     def carried(self) -> Array:
-        """The torque halfway through the sub-step, N m."""
-        return self.torque - self.damping * self.halfway
-
-    @property
-    def halfway(self) -> Array:
-        """The velocity halfway through the sub-step, rad/s."""
-        return (self.velocity + self.coming) / 2
+        """The torque that is applied, N m: damping is, by the velocity at the end."""
+        return self.torque - self.damping * self.coming
 
 
 class Term:

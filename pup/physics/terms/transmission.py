@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pup.physics.implicit import implicit_share
 from pup.physics.terms import kernels
-from pup.physics.terms.base import Flow, Quantity, Scene, Term
+from pup.physics.terms.base import Flow, Quantity, Scene, Term, begin
 from pup.physics.writer import FieldWriter
 
 Array = NDArray[np.float64]
@@ -65,7 +65,7 @@ class Drivetrain(Term):
     """
 
     effect = "drivetrain"
-    state = ("_position", "_velocity", "_free", "_heft", "_torque", "_damping")
+    state = ("_position", "_velocity", "_free", "_heft", "_torque", "_damping", "_before")
 
     def __init__(self, parts: Sequence[Transmission], scene: Scene) -> None:
         self._gap = np.asarray(sum(part.gap() for part in parts))
@@ -98,6 +98,7 @@ class Drivetrain(Term):
         self._free = np.zeros_like(self._gap)
         self._heft = np.ones_like(self._gap)
         self._torque, self._damping = np.zeros_like(self._gap), np.zeros_like(self._gap)
+        self._before = np.full_like(self._gap, np.nan)  # velocity of the link at the last sub-step
 
     def fields(self, writer: FieldWriter) -> None:
         """See Term: the rotor leaves the link."""
@@ -140,7 +141,14 @@ class Drivetrain(Term):
         self._first = before - (self._velocity - before) / 2
 
     def flow(self, flow: Flow) -> None:
-        """See Term."""
+        """See Term: what has acted on the motor, acts on the link from here on."""
+        n, before = len(flow.torque), self._before[: len(flow.torque)]
+        # Without a motor of its own, what turns a link bears the joint's damping, too.
+        driven = flow.carried() + flow.brake + flow.viscous * flow.coming
+        flow.motor = np.where(self._active[:n], driven, np.nan)
+        begin(before, flow.link)
+        flow.velocity, flow.coming = flow.link, 2 * flow.link - before
+        before[:] = flow.link
         kernels.engage(
             flow.torque,
             flow.damping,

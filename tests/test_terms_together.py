@@ -1,0 +1,85 @@
+"""Effects that act on each other, on one joint against an independent integrator."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from terms import BENCH, SERVO, Array, Law, Row, play, servo, solved, weight, with_terms
+from test_terms_solved import AT, FIRST, KD, LINK, ROTOR, RUN, bristle
+
+from pup.physics.mujoco_batch import MujocoSimulator
+from pup.physics.parameters import ParameterSpace
+from pup.physics.terms.friction import GRIP
+from pup.physics.terms.transmission import RELAXATION
+
+GIVE = 0.008
+SOFT = {f"joint_compliance/compliance{AT}": GIVE}
+
+
+def bend(q: float, v: float, motor: float, speed: float) -> float:
+    """Torque of what gives between a motor and its link, which its encoder is at, N m."""
+    return (motor - q + RELAXATION * (speed - v)) / GIVE
+
+
+def lagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, motor, speed, torque = x
+    passed = bend(q, v, motor, speed)
+    follows = (servo(target - q, speed) + KD * speed - torque) / 0.008
+    return passed + weight(q), [speed, (torque - KD * speed - passed) / ROTOR, follows]
+
+
+def lossy(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, motor, speed, z = x
+    passed, torque = bend(q, v, motor, speed), servo(target - q, speed)
+    left = torque - 0.2 * abs(torque) * z / GRIP
+    return passed + weight(q), [speed, (left - passed) / ROTOR, bristle(speed, z)]
+
+
+def by_load(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, motor, speed, z = x
+    passed, torque = bend(q, v, motor, speed), servo(target - q, speed)
+    friction = 0.15 * abs(torque + passed) * z / GRIP
+    return passed + weight(q) - friction, [speed, (torque - passed) / ROTOR, bristle(v, z)]
+
+
+BEHIND: dict[str, tuple[Row, Law, Sequence[float]]] = {
+    "actuator_lag": ({f"actuator_lag/time{AT}": 0.008}, lagging, (0.0, 0.0, FIRST)),
+    "gear_efficiency": ({f"gear_efficiency/loss{AT}": 0.2}, lossy, (0.0, 0.0, 0.0)),
+    "load_dependent_friction": (
+        {f"load_dependent_friction/share{AT}": 0.15},
+        by_load,
+        (0.0, 0.0, 0.0),
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=[0.002, 0.0005])
+def behind(request: pytest.FixtureRequest) -> dict[str, Array]:
+    """Each with a motor that reaches its link through a give, and that alone."""
+    rows = [SERVO | SOFT | dict(row) for row, *_ in BEHIND.values()]
+    seen = play(replace(BENCH, timestep=request.param), RUN, [*rows, SERVO | SOFT])
+    return dict(zip([*BEHIND, "nothing"], seen.position[:, :, 0], strict=True))
+
+
+@pytest.mark.parametrize("effect", BEHIND)
+def test_what_acts_on_a_motor_goes_by_its_speed_not_by_the_link_s(
+    effect: str, behind: dict[str, Array]
+) -> None:
+    _, law, further = BEHIND[effect]
+    error = behind[effect] - solved(RUN, law, *further, inertia=LINK)
+    assert np.sqrt(np.mean(error**2)) < 4e-4
+    assert np.abs(behind[effect] - behind["nothing"]).max() > 1e-2
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_load_is_the_same_behind_next_to_no_play(damping: float) -> None:
+    """Of the joint's damping, too, which acts on the motor where it has its own."""
+    size, gap = f"load_dependent_friction/share{AT}", f"backlash/gap{AT}"
+    given = with_terms(BENCH, [SERVO | {size: 0.15, gap: play} for play in (1e-6, 0.0)])
+    space = given.space.plus(
+        ParameterSpace(("damping/servo",), ("N m s/rad",), *np.full((3, 1), damping))
+    )
+    values = np.hstack([given.values, np.full((2, 1), damping)])
+    loose, firm = MujocoSimulator(BENCH, [RUN], "pd").replay(space.candidates(values)).position
+    assert np.sqrt(np.mean((loose - firm) ** 2)) < 3e-4
