@@ -83,3 +83,11 @@ def test_load_is_the_same_behind_next_to_no_play(damping: float) -> None:
     values = np.hstack([given.values, np.full((2, 1), damping)])
     loose, firm = MujocoSimulator(BENCH, [RUN], "pd").replay(space.candidates(values)).position
     assert np.sqrt(np.mean((loose - firm) ** 2)) < 3e-4
+
+
+@pytest.mark.parametrize("nominal", [0.001, 0.003])
+def test_more_rotor_behind_a_give_is_more_rotor_from_the_start(nominal: float) -> None:
+    whole = SERVO | SOFT | {"armature": nominal + 0.003}
+    parts = SERVO | SOFT | {"armature": nominal, f"armature/inertia{AT}": 0.003}
+    one, two = play(BENCH, RUN, [whole, parts]).position[:, :, 0]
+    assert one == pytest.approx(two, abs=1e-9)

@@ -235,6 +235,8 @@ class Run:
 
     def _start(self, nsim: int) -> None:
         """Put the simulations where the recordings start."""
+        for term in self.terms:
+            term.prepare()  # by the scene that the terms' model fields have changed
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qpos[:] = self._starting_qpos()
         velocity = np.repeat(self.group.start_velocity, self.candidates, axis=0)
