@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from terms import BENCH, SERVO, Array, Law, Row, play, servo, solved, weight, with_terms
-from test_terms_solved import AT, FIRST, KD, LINK, ROTOR, RUN, bristle
+from test_terms_solved import AT, FIRST, KD, KP, LIMIT, LINK, ROTOR, RUN, bristle
 
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import ParameterSpace
@@ -70,6 +70,26 @@ def test_what_acts_on_a_motor_goes_by_its_speed_not_by_the_link_s(
     error = behind[effect] - solved(RUN, law, *further, inertia=LINK)
     assert np.sqrt(np.mean(error**2)) < 4e-4
     assert np.abs(behind[effect] - behind["nothing"]).max() > 1e-2
+
+
+def warm(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, warmth, torque = x
+    left = 1 - 0.3 * warmth
+    asked = left * np.clip(KP * (target - q) - KD * v, -LIMIT, LIMIT)
+    rates = [abs(asked) / LIMIT - warmth / 40, (asked + left * KD * v - torque) / 0.008]
+    return torque - left * KD * v + weight(q), rates
+
+
+@pytest.mark.parametrize("timestep", [0.002, 0.0005])
+def test_the_damping_of_a_warm_winding_is_what_does_not_lag(timestep: float) -> None:
+    lag = {f"actuator_lag/time{AT}": 0.008}
+    drift = {f"thermal_drift/{name}{AT}": v for name, v in (("rate", 0.3), ("load", 1.0))}
+    both, cold = play(
+        replace(BENCH, timestep=timestep), RUN, [SERVO | lag | drift, SERVO | lag]
+    ).position[:, :, 0]
+    error = both - solved(RUN, warm, 0.0, FIRST)
+    assert np.sqrt(np.mean(error**2)) < 1e-4
+    assert np.abs(both - cold).max() > 3e-3
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.2])

@@ -90,12 +90,13 @@ class Servos:
         time: float | Array = step * self.scene.timestep
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
-        error, torque, damping = self._answer(target.now, sensed)
+        error, torque, damping, own = self._answer(target.now, sensed)
         if target.before is not None:
             share = self._spread(target.share, running)
-            old, was, damped = self._answer(target.before, sensed)
+            old, was, damped, own_then = self._answer(target.before, sensed)
             kernels.blend(error, torque, damping, old, was, damped, share)
-        own = self.law.unlimited(error, sensed[1])[1] if self.needs_law_damping else None
+            if own is not None and own_then is not None:
+                own = share * own + (1 - share) * own_then
         on = self._on(step, running, time)
         if on is not None:
             torque *= on
@@ -169,8 +170,8 @@ class Servos:
         self,
         target: Array,
         sensed: tuple[Array, Array],
-    ) -> tuple[Array, Array, Array]:
-        """The law's error, torque and viscous coefficient for one target."""
+    ) -> tuple[Array, Array, Array, Array | None]:
+        """The law's error, torque and viscous coefficient for one target; see Flow.law_damping."""
         position, velocity = sensed
         if target.ndim == 3:
             by_recording = position.reshape(len(target), self.candidates, -1)
@@ -179,11 +180,12 @@ class Servos:
             error = target - position
         for term in self.erring:
             error = term.error(error)
-        if not self.driving:
-            return error, *self.limited.answer(error, velocity)
+        if not self.driving and not self.needs_law_damping:
+            return error, *self.limited.answer(error, velocity), None
         torque, damping = self.law.unlimited(error, velocity)
         drive = Drive(error, velocity, torque, damping, *self.limited.limits(len(error)))
         for term in self.driving:
             term.drive(drive)
+        own = damping.copy() if self.needs_law_damping else None
         self.limited.limit(torque, damping, velocity, drive.upper, drive.lower, drive.slope)
-        return error, torque, damping
+        return error, torque, damping, own

@@ -127,7 +127,7 @@ class Flow:
       link: its velocity, rad/s.
       velocity: of what the torque moves, rad/s.
       coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
-      law_damping: the law's damping off its torque limit, N m s/rad; only where a term asks.
+      law_damping: the servo's damping off its torque limit, N m s/rad; only where a term asks.
       torque: applied as it is, N m.
       damping: applied times the velocity at the sub-step's end, N m s/rad.
       brake: against the torque, by damping outside the servo, N m.
