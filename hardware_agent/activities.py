@@ -1,21 +1,26 @@
 """What the robot does between two ticks: one small class each, asked for a target every tick."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hardware_agent.config import ControlSettings
-from hardware_agent.rollout import Rollout
+from hardware_agent.limits import Applied
+from hardware_agent.rollout import Rollout, Row
 from hardware_agent.senses import Senses
+from pup.script import Script
 from pup.wire import AgentState, Assign, Outcome
 
 Array = NDArray[np.float64]
 
 RETURN = 0.5  # s from where a walk's end left the joints to the pose that stands
 WATCHED = 2.0  # s after that in which it may still fall; then people take it
+REST = 1.5  # s in a script's first pose before it begins
+FALLEN = 1.0  # rad of roll or pitch; the authors switch their robot off there, and a fall ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,30 @@ class Walked:
     time: float
 
 
-Event = Ended | Posed | Settled | Walked
+@dataclass(frozen=True, eq=False)
+class Ready:
+    """The robot is in a script's first pose."""
+
+    script: Script
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A script is over.
+
+    Attributes:
+      script: which.
+      rows: of its ticks.
+      reason: why it ended before its end; empty where it did not.
+    """
+
+    script: Script
+    rows: list[Row]
+    reason: str = ""
+
+
+TrialEvent = Ended | Posed | Settled | Walked
+Event = TrialEvent | Ready | Played
 Emit = Callable[[Event], None]
 
 
@@ -226,9 +254,103 @@ class Walk:
         self.emit(Walked(self.assign, len(self.rollout.rows), time))
         return target, self
 
+    def keep(self, senses: Senses, applied: Applied) -> None:
+        """Add a tick to what is recorded."""
+        self.rollout.keep(senses, applied)
+
     def _end(self, senses: Senses, outcome: Outcome, reason: str) -> tuple[Array, Activity]:
         time = self.rollout.time(senses.time)
         self.emit(Ended(self.assign, outcome, reason, self.rollout, time))
         pose = self.rollout.pose
         stand = Ramp(pose, pose, WATCHED, Hold(pose), alone=True)
         return Ramp(senses.goal, pose, RETURN, stand, alone=True).step(senses)
+
+
+@dataclass(eq=False)
+class Play:
+    """Wait in a script's first pose, and play it when told to.
+
+    Attributes:
+      script: which.
+      ramp: time from one pose to the next on the way home, s.
+      emit: tells of it.
+      go: set when it may begin.
+      rows: of its ticks so far.
+    """
+
+    script: Script
+    ramp: float
+    emit: Emit
+    go: bool = False
+    state: AgentState = AgentState.RUNNING
+    alone: bool = False
+    ready: float | None = None
+    begun: float | None = None
+    rows: list[Row] = field(default_factory=list)
+
+    def step(self, senses: Senses) -> tuple[Array, Activity]:
+        """See Activity."""
+        if self.ready is None:
+            self.ready = senses.time
+            self.emit(Ready(self.script))
+        rested = senses.time - self.ready >= REST
+        if self.begun is None:
+            if not (self.go and rested):
+                return self.script.target[0], self
+            self.begun = senses.time
+        time = self._time(senses)
+        if time > self.script.duration + 1e-9 or (self.script.falls and _fallen(senses)):
+            self.emit(Played(self.script, self.rows))
+            return self._home().step(senses)
+        return self.script.at(time), self
+
+    def keep(self, senses: Senses, applied: Applied) -> None:
+        """Add a tick to what is recorded."""
+        if self.begun is not None:
+            self.rows.append(Row(self._time(senses), senses, applied))
+
+    def _time(self, senses: Senses) -> float:
+        assert self.begun is not None
+        return round(senses.time - self.begun, 9)
+
+    def _home(self) -> Activity:
+        if self.script.falls:
+            return Lie()
+        return along((self.script.target[-1], *self.script.back), self.ramp)
+
+
+def along(poses: Sequence[Array], ramp: float, then: Activity | None = None) -> Activity:
+    """Go from pose to pose, and stay in the last or do something else.
+
+    Args:
+      poses: rad, the first of them where the robot is.
+      ramp: time from one to the next, s.
+      then: what comes after.
+    """
+    activity = Hold(poses[-1]) if then is None else then
+    for begin, end in reversed(list(pairwise(poses))):
+        activity = Ramp(begin, end, ramp, activity, activity.state)
+    return activity
+
+
+def _fallen(senses: Senses) -> bool:
+    imu = senses.imu
+    return imu is not None and max(abs(imu.roll), abs(imu.pitch)) > FALLEN
+
+
+def trial_of(activity: Activity | None) -> Settle | Walk | None:
+    """The part of a trial that an activity is, or leads to."""
+    last = _last(activity)
+    return last if isinstance(last, Settle | Walk) else None
+
+
+def script_of(activity: Activity | None) -> Play | None:
+    """The script that an activity plays, or leads to."""
+    last = _last(activity)
+    return last if isinstance(last, Play) else None
+
+
+def _last(activity: Activity | None) -> Activity | None:
+    while isinstance(activity, Ramp):
+        activity = activity.then
+    return activity

@@ -16,6 +16,8 @@ from pup.errors import InputError
 
 DONE, FAILED, REFUSED = 0, 1, 2
 PLACE = "/etc/pup-agent/agent.toml"
+SCRIPTS = "file of `pup record --scripts`, which the agent can read, or a folder of them"
+MOST = 100  # repeats of a script
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
         ("arm", "let the trial that waits start"),
         ("skip", "do not run the trial that waits"),
         ("distance", "tell how far the robot came, in metres"),
+        ("play", "play scripts and record them; whoever stands at the robot agrees to each"),
         ("keys", "make a pair of CURVE keys for the link"),
     ):
         verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
@@ -60,6 +63,10 @@ def _parser() -> argparse.ArgumentParser:
             verb.add_argument("--json", action="store_true", help="print one JSON object")
         elif name == "distance":
             verb.add_argument("metres", type=float)
+        elif name == "play":
+            verb.add_argument("scripts", type=Path, nargs="+", metavar="SCRIPT", help=SCRIPTS)
+            verb.add_argument("--repeats", type=int, default=1, metavar="N", help="of each script")
+            verb.add_argument("--auto", action="store_true", help="ask nobody; see control.gate")
         elif name == "keys":
             verb.add_argument("name", help="of the files NAME.key and NAME.key_secret")
             verb.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -167,6 +174,19 @@ def _operate(options: argparse.Namespace) -> int:
     return operate(Settings.read(options.config).socket)
 
 
+def _play(options: argparse.Namespace) -> int:
+    from hardware_agent.playing import play
+
+    if not 1 <= options.repeats <= MOST:
+        raise InputError(f"--repeats: {options.repeats} is not 1 to {MOST}")
+    files = [
+        f for at in options.scripts for f in (sorted(at.glob("*.json")) if at.is_dir() else [at])
+    ]
+    if not files:
+        raise InputError(f"{options.scripts[0]}: no *.json in this folder")
+    return play(Settings.read(options.config).socket, files, options.repeats, options.auto)
+
+
 def _keys(options: argparse.Namespace) -> int:
     import zmq.auth
 
@@ -189,6 +209,7 @@ VERBS = {
     "arm": _say("arm"),
     "skip": _say("skip"),
     "distance": _distance,
+    "play": _play,
     "keys": _keys,
 }
 

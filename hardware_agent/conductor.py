@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware_agent.activities import Ended, Event, Posed, Settled, Walked
+from hardware_agent.activities import Ended, Posed, Settled, TrialEvent, Walked
 from hardware_agent.config import Settings
 from hardware_agent.distance import Distance, DistanceError
 from hardware_agent.motion import Motion
@@ -154,7 +154,7 @@ class Conductor:
         else:
             self._motion.cancel("cancelled")
 
-    def handle(self, event: Event) -> None:
+    def handle(self, event: TrialEvent) -> None:
         """Something happened in the control loop."""
         if self._assign is None or event.assign != self._assign:
             return

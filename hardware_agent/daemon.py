@@ -10,15 +10,16 @@ import queue
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from shutil import which
 from typing import Any
 
-from hardware_agent.activities import Event
+from hardware_agent.activities import Event, Played, Ready
 from hardware_agent.body import Body as RobotBody
-from hardware_agent.conductor import Conductor
+from hardware_agent.conductor import Conductor, Stage
 from hardware_agent.config import Settings
 from hardware_agent.control import ControlServer
 from hardware_agent.distance import distance_of
@@ -30,6 +31,7 @@ from hardware_agent.motion import LATE, Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.port import BusError, BusyError
 from hardware_agent.recordings import Recordings
+from hardware_agent.scripts import Scripts
 from hardware_agent.status import brief
 from hardware_agent.systemd import notify
 from hardware_agent.trials import TrialBook
@@ -57,7 +59,7 @@ RESEND = 2.0  # s between two sendings of an end that is not acknowledged
 TAKEOVER = 5.0  # s that another process may still have the bus
 PATIENCE = 5.0  # s that a command waits for the loop
 CONFIRMED = 1.5  # s in which all servos should have said that they are limp
-MOVING = ("enable", "arm")  # commands that are not done once the robot was stopped
+MOVING = ("enable", "arm", "pose", "play")  # commands that are not done once the robot was stopped
 
 
 @dataclass
@@ -128,6 +130,8 @@ class Agent:
             self._recordings,
             self._send,
         )
+        scripts, source = self._settings.state / "scripts", self._settings.control.source
+        self._scripts = Scripts(self._robot, self._motion, scripts, source)
         self._motion.start()
         self._control.start()
         if self._link is not None:
@@ -186,6 +190,7 @@ class Agent:
             "trial": conductor.trial,
             "stage": str(conductor.stage),
             "waiting": conductor.waiting,
+            "script": self._scripts.told,
         }
 
     def _open(self) -> None:
@@ -217,7 +222,11 @@ class Agent:
         while not self._heard.empty():
             self._receive(self._heard.get())
         while not self._events.empty():
-            self._conductor.handle(self._events.get())
+            event = self._events.get()
+            if isinstance(event, Ready | Played):
+                self._scripts.handle(event)
+            else:
+                self._conductor.handle(event)
         self._conductor.tend()
         self._beat()
 
@@ -274,11 +283,24 @@ class Agent:
             refused = self._motion.enable(stopped)
         elif do == "disable":
             refused = self._motion.disable()
+        elif do in ("pose", "play"):
+            self._script(call.command, stopped)
+            return None
         else:
-            return self._order(call.command)
+            self._order(call.command)
+            return None
         if refused is not None:
             raise InputError(refused.reason)
         return {"state": str(self._motion.state)}
+
+    def _script(self, command: dict[str, Any], stopped: Callable[[], bool]) -> None:
+        """What the operator lets the robot play."""
+        if command["do"] == "play":
+            self._scripts.play(stopped)
+        elif self._conductor.stage in (Stage.NONE, Stage.WAITING):
+            self._scripts.pose(command.get("script"), stopped)
+        else:
+            raise InputError("a trial is under way")
 
     def _order(self, command: dict[str, Any]) -> None:
         """What the operator tells of a trial."""

@@ -1,18 +1,11 @@
 """The control loop: a thread that owns the body and does the same few things every tick.
 
-Read all sensors, ask the rules of safety, ask the activity for a target, send it. Others talk to it
-by requests, which it takes between two ticks, and hear of it by events; nobody waits for it, and it
-waits for nobody. Only in lock-step, where the robot's time stands still between two commands, does
-it wait for the answer to an event that has one: so a trial does not hang on how long that takes.
+Read all sensors, ask the rules of safety, ask the activity for a target, send it.
 """
 
 import gc
-import os
-import queue
-import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 
 import numpy as np
 
@@ -22,33 +15,33 @@ from hardware_agent.activities import (
     Event,
     Hold,
     Lie,
-    Posed,
+    Play,
+    Played,
     Ramp,
     Settle,
-    Settled,
     Walk,
+    along,
+    script_of,
+    trial_of,
 )
 from hardware_agent.body import Body
 from hardware_agent.limits import Applied
-from hardware_agent.metronome import Metronome
+from hardware_agent.loop import Loop
 from hardware_agent.port import BusError
-from hardware_agent.request import Request
 from hardware_agent.rollout import Rollout
 from hardware_agent.senses import Response, Senses, Trip
 from hardware_agent.status import MotionStatus, Refused, brief
 from hardware_agent.watchdog import Watchdog
 from pup.errors import InputError
+from pup.script import Script
 from pup.wire import AgentState, Assign, Outcome
 
 REOPEN = 1.0  # s between tries to find a bus that is gone
-PRIORITY = 20  # of the real-time scheduler
 LATE = Refused("the robot was stopped meanwhile; ask again")
-STANDSTILL = 10.0  # s, the longest wait for an answer in lock-step
-BEAT = 0.05  # s between two beats meanwhile
 STATISTICS = 33  # ticks between updates of the loop's statistics
 
 
-class Motion(threading.Thread):
+class Motion(Loop):
     """The control loop.
 
     Args:
@@ -60,19 +53,9 @@ class Motion(threading.Thread):
     def __init__(
         self, body: Body, watchdog: Watchdog | None, emit: Callable[[Event], None]
     ) -> None:
-        super().__init__(name="motion", daemon=True)
-        self._body, self._watchdog = body, watchdog
-        self._settings = body.settings.control
-        self._emit = emit
-        self._events: list[Event] = []
-        self.metronome = Metronome(1 / self._settings.rate, self._settings.clock == "lockstep")
-        self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
-        self._wake = threading.Event()
-        self._stop_reason: str | None = None
-        self._quit = False
+        super().__init__(body, watchdog, emit)
         self._activity: Activity | None = None
         self._state, self._reason = AgentState.DISABLED, ""
-        self._bus = body.ready
         self._limited: dict[str, str] = {}
         self._hurried = False
         self._count = 0
@@ -118,6 +101,19 @@ class Motion(threading.Thread):
         """
         self._ask(lambda senses: self._placed(assign, cold))
 
+    def pose(self, script: Script, stopped: Callable[[], bool]) -> Refused | None:
+        """Go to a script's first pose.
+
+        Args:
+          script: which.
+          stopped: whether somebody has stopped the robot since this was asked for.
+        """
+        return self._ask(lambda senses: LATE if stopped() else self._pose(senses, script))
+
+    def play(self, stopped: Callable[[], bool]) -> Refused | None:
+        """Play the script whose first pose the robot is in."""
+        return self._ask(lambda senses: LATE if stopped() else self._play())
+
     @property
     def state(self) -> AgentState:
         """Of the robot, as of now; `status` is as of the last tick's end."""
@@ -136,33 +132,7 @@ class Motion(threading.Thread):
         """Whether something waits for time to pass: lock-step need not keep to the clock then."""
         self._hurried = hurried
 
-    def close(self) -> None:
-        """End the thread; the robot is limp afterwards."""
-        self._quit = True
-        self._wake.set()
-        if self.ident is not None:
-            self.join(timeout=5.0)
-
-    def _ask(self, act: Callable[[Senses], Refused | None]) -> Refused | None:
-        request = Request(act)
-        self._requests.put(request)
-        refused = Refused(f"the control loop does not run: {self.status.reason or 'no bus'}")
-        return request.wait(2.0, refused)
-
     # The loop.
-
-    def run(self) -> None:
-        """Tick until closed."""
-        self._realtime()
-        gc.collect()
-        gc.freeze()
-        try:
-            while not self._quit:
-                now = self.metronome.wait(self._wake)
-                self._beat()
-                self._tick(now)
-        finally:
-            self._body.close()
 
     def _tick(self, now: float) -> None:
         if self._stop_reason is not None:
@@ -187,45 +157,12 @@ class Motion(threading.Thread):
             self._refuse_all(f"bus: {error}")
             self._tell()
             senses = None
-        busy = isinstance(self._activity, Ramp | Settle | Walk)
+        busy = isinstance(self._activity, Ramp | Settle | Walk | Play)
         self.metronome.pace(not (busy or self._hurried))
         self._count += 1
         if self._count % STATISTICS == 0:
             self._timing = self.metronome.timing()
         self.status = self._told(senses)
-
-    def _serve(self, senses: Senses) -> None:
-        """Tell what happened, and do what is asked."""
-        while (request := self._next(self._tell())) is not None:
-            request.run(senses)
-
-    def _tell(self) -> float:
-        """Tell what happened; returns for how long time may stand still until it is answered, s."""
-        events, self._events = self._events, []
-        answered = any(isinstance(event, Posed | Settled | Ended) for event in events)
-        if answered and self.metronome.lockstep:
-            with suppress(BusError):
-                self._body.bus.read()  # once this is answered, what was written has passed
-        for event in events:
-            self._emit(event)
-        return STANDSTILL if answered and self.metronome.lockstep else 0.0
-
-    def _next(self, patience: float) -> "Request | None":
-        deadline = time.monotonic() + patience
-        while self._requests.empty() and time.monotonic() < deadline:
-            if self._stop_reason is not None or self._quit:
-                return None
-            self._beat()
-            with suppress(queue.Empty):
-                return self._requests.get(timeout=BEAT)
-        if self._requests.empty() or self._stop_reason is not None:
-            return None
-        return self._requests.get()
-
-    def _refuse_all(self, reason: str) -> None:
-        """What was asked before a stop is not done after it."""
-        while not self._requests.empty():
-            self._requests.get().refuse(Refused(reason))
 
     def _move(self, senses: Senses) -> None:
         """Ask the rules, then the activity, and send its target."""
@@ -242,13 +179,14 @@ class Motion(threading.Thread):
             self._trip(applied, senses)
             return
         self._limited = applied.limited
-        if isinstance(after, Walk):
-            after.rollout.keep(senses, applied)
+        if isinstance(after, Walk | Play):
+            after.keep(senses, applied)
         self._become(after)
 
     def _become(self, activity: Activity) -> None:
-        if isinstance(activity, Walk) != isinstance(self._activity, Walk):
-            (gc.disable if isinstance(activity, Walk) else gc.enable)()
+        now, before = (isinstance(a, Walk | Play) for a in (activity, self._activity))
+        if now != before:
+            (gc.disable if now else gc.enable)()
         self._activity, self._state = activity, activity.state
 
     def _trip(self, trip: Trip, senses: Senses | None) -> None:
@@ -267,8 +205,8 @@ class Motion(threading.Thread):
             self._reason = str(trip)
         if isinstance(activity, Walk):
             self._end_walk(activity, trip, senses, rows_goal)
-        elif (trial := _trial(activity)) is not None:
-            self._happened(Ended(trial.assign, Outcome.ABORTED, str(trip), trial.rollout))
+        else:
+            self._over(activity, str(trip))
 
     def _end_walk(self, walk: Walk, trip: Trip, senses: Senses | None, goal: np.ndarray) -> None:
         if senses is not None:
@@ -303,8 +241,8 @@ class Motion(threading.Thread):
     # What requests do, in this thread.
 
     def _enable(self, senses: Senses) -> Refused | None:
-        if _trial(self._activity) is not None:
-            return Refused("a trial is under way")
+        if busy := self._busy():
+            return busy
         if self._activity is None:
             self._beat(torque=True)  # the watchdog watches from before it is on
             self.metronome.leave_out()
@@ -319,61 +257,86 @@ class Motion(threading.Thread):
         return None
 
     def _disable(self, senses: Senses) -> Refused | None:
-        trial = _trial(self._activity)
+        activity = self._activity
         self._body.limp()
         gc.enable()
         self._activity = None
         self._state, self._reason = AgentState.DISABLED, ""
-        if trial is not None:
-            self._happened(Ended(trial.assign, Outcome.ABORTED, "disabled", trial.rollout))
+        self._over(activity, "disabled")
         return None
 
     def _prepare(
         self, senses: Senses, assign: Assign, rollout: Rollout, upright: np.ndarray | None
     ) -> Refused | None:
-        if self._activity is None:
-            return Refused(f"the robot is {self._state}; enable it first")
-        if _trial(self._activity) is not None:
-            return Refused("another trial is under way")
-        begin = self._body.goal
-        if isinstance(self._activity, Lie):
-            begin = senses.position
-            self._body.command(begin, senses.time)
-            self._body.full_power()
-            self._body.guard.reset()
+        if refused := self._idle():
+            return refused
+        begin = self._taken_up(senses)
         settle = Settle(assign, rollout, upright, self._settings, self._happened)
         self._become(Ramp(begin, rollout.pose, self._settings.ramp, settle, AgentState.ARMED))
         return None
+
+    def _pose(self, senses: Senses, script: Script) -> Refused | None:
+        if refused := self._idle():
+            return refused
+        ramp, begin = self._settings.ramp, self._taken_up(senses)
+        self._become(along((begin, *script.way), ramp, Play(script, ramp, self._happened)))
+        return None
+
+    def _play(self) -> Refused | None:
+        if not isinstance(self._activity, Play) or self._activity.go:
+            return Refused("no script waits in its first pose")
+        self._activity.go = True
+        return None
+
+    def _idle(self) -> Refused | None:
+        """Why the robot cannot begin with anything; None where it can."""
+        if self._activity is None:
+            return Refused(f"the robot is {self._state}; enable it first")
+        return self._busy()
+
+    def _busy(self) -> Refused | None:
+        if trial_of(self._activity) is not None:
+            return Refused("a trial is under way")
+        if script_of(self._activity) is not None:
+            return Refused("a script is under way")
+        return None
+
+    def _taken_up(self, senses: Senses) -> np.ndarray:
+        """The pose to begin from; with full power where the robot lay."""
+        if not isinstance(self._activity, Lie):
+            return self._body.goal
+        self._body.command(senses.position, senses.time)
+        self._body.full_power()
+        self._body.guard.reset()
+        return senses.position
 
     def _go(self, assign: Assign) -> None:
         if isinstance(self._activity, Settle) and self._activity.assign == assign:
             self._activity.go = True
 
     def _placed(self, assign: Assign, cold: bool) -> None:
-        trial = _trial(self._activity)
+        trial = trial_of(self._activity)
         if isinstance(trial, Settle) and trial.assign == assign:
             trial.placed = True
             if cold:
                 self._body.guard.warm(0.0)
 
     def _cancel(self, reason: str) -> None:
-        trial = _trial(self._activity)
+        trial = trial_of(self._activity)
         if isinstance(trial, Walk):
             trial.cancelled = True
         elif trial is not None:
-            self._happened(Ended(trial.assign, Outcome.ABORTED, reason, trial.rollout))
+            self._over(trial, reason)
             self._become(Hold(self._body.goal))
 
     # The rest.
 
-    def _happened(self, event: Event) -> None:
-        """Keep what an activity tells until its target is sent."""
-        self._events.append(event)
-
-    def _beat(self, torque: bool = False) -> None:
-        if self._watchdog is not None:
-            doubted = self._bus and self._body.doubted
-            self._watchdog.beat(torque or self._body.torque or doubted)
+    def _over(self, activity: Activity | None, reason: str) -> None:
+        """A trial or a script ends before it has walked, or come to its end."""
+        if (trial := trial_of(activity)) is not None:
+            self._happened(Ended(trial.assign, Outcome.ABORTED, reason, trial.rollout))
+        elif (play := script_of(activity)) is not None:
+            self._happened(Played(play.script, play.rows, reason))
 
     def _told(self, senses: Senses | None) -> MotionStatus:
         return MotionStatus(
@@ -390,15 +353,3 @@ class Motion(threading.Thread):
             doubted=self._body.long_doubted,
             limp=self._bus and not self._body.torque and not self._body.doubted,
         )
-
-    def _realtime(self) -> None:
-        if self._settings.realtime:
-            with suppress(PermissionError, OSError):  # then it is one thread among others
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-
-
-def _trial(activity: Activity | None) -> Settle | Walk | None:
-    """The part of a trial that an activity is, or leads to."""
-    if isinstance(activity, Ramp):
-        return _trial(activity.then)
-    return activity if isinstance(activity, Settle | Walk) else None

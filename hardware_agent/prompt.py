@@ -44,9 +44,8 @@ def operate(socket: Path) -> int:
     """
     if not sys.stdin.isatty():
         raise InputError("this is no terminal; use `pup-agent arm`, `stop` and `distance`")
-    before = {n: signal.signal(n, _leave) for n in (signal.SIGHUP, signal.SIGTERM)}
     try:
-        with _keys():
+        with leaving(), keys():
             print(HELP, flush=True)
             while trial := _watch(socket):
                 _measure(socket, trial)
@@ -55,9 +54,6 @@ def operate(socket: Path) -> int:
         if say(socket, {"do": "health"})["stage"] in MOVING:
             say(socket, {"do": "stop", "reason": "the operator's terminal is gone"})
         return 1
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _watch(socket: Path) -> str:
@@ -74,7 +70,7 @@ def _watch(socket: Path) -> str:
                 print("ENTER starts the trial, s skips it")
         if asked == "distance":
             return str(told["trial"])
-        key = _key()
+        key = key_pressed()
         if key == "q":
             return ""
         if key:
@@ -100,7 +96,7 @@ def _measure(socket: Path, trial: str) -> None:
     """Let a distance be typed; a key that is no part of one stops the robot, as ever."""
     print(ASKED, end="", flush=True)
     typed = ""
-    while (key := _key()) not in ENTER:
+    while (key := key_pressed()) not in ENTER:
         if not key:
             told = say(socket, {"do": "health"})
             if told["waiting"] != "distance" or told["trial"] != trial:  # told elsewhere
@@ -127,7 +123,7 @@ def _measure(socket: Path, trial: str) -> None:
         print(error)
 
 
-def _key() -> str:
+def key_pressed() -> str:
     """A key that is pressed within a moment; empty for none.
 
     Raises:
@@ -147,7 +143,18 @@ def _leave(*_: object) -> NoReturn:
 
 
 @contextmanager
-def _keys() -> Iterator[None]:
+def leaving() -> Iterator[None]:
+    """A hangup or an end of the process is told as LeftError."""
+    before = {n: signal.signal(n, _leave) for n in (signal.SIGHUP, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def keys() -> Iterator[None]:
     """Keys come one by one, as they are pressed, Ctrl-C, Ctrl-Z and Ctrl-S among them.
 
     None must get lost that should stop the robot.

@@ -34,7 +34,7 @@ class AgentState(StrEnum):
       DISABLED: the servos' torque is off.
       ENABLED: the robot holds its pose.
       ARMED: a trial is about to start.
-      RUNNING: a trial moves the robot.
+      RUNNING: a trial moves the robot, or a script that is recorded.
       STOPPED: somebody stopped it; the servos' torque is off until it is enabled anew.
       FAULT: a rule of safety stopped it; likewise.
     """

@@ -32,7 +32,7 @@ def parser(
         ("run", "the whole job, stage by stage; run again, it resumes", _run),
         ("import", "turn other people's logs into recordings", import_logs),
         ("export", "turn recordings, and replays of them, into other programs' files", export),
-        ("record", "record scripted motions of a virtual robot", record),
+        ("record", "record scripted motions of a virtual robot, or script them", record),
         ("presysid", "fit a robot's parameters to recordings, with bounds", presysid),
         ("train", "train a policy that walks, within bounds; run again, it resumes", train),
         ("transfer", "find what walks furthest on a robot, by a running service", transfer),

@@ -79,7 +79,7 @@ def export(verb: argparse.ArgumentParser) -> None:
 
 
 def record(verb: argparse.ArgumentParser) -> None:
-    """What a virtual robot does."""
+    """What a robot does."""
     verb.add_argument(
         "motions",
         nargs="+",
@@ -88,9 +88,15 @@ def record(verb: argparse.ArgumentParser) -> None:
         "fall:left are single variants",
     )
     robot(verb, required=True)
-    out(verb, "a Parquet file per recording; it may hold no other recordings")
-    verb.add_argument("--virtual", action="store_true", help="on a simulated robot (required)")
-    seed(verb, "; also which robot it is")
+    out(verb, "a file per recording or script; it may hold no others")
+    where = verb.add_mutually_exclusive_group(required=True)
+    where.add_argument("--virtual", action="store_true", help="on a simulated robot")
+    where.add_argument(
+        "--scripts",
+        action="store_true",
+        help="by the robot itself: only make scripts, which `pup-agent play` plays there",
+    )
+    seed(verb, "; also which virtual robot it is")
     actuator(verb)
     verb.add_argument(
         "--repeats", type=number(1, 100), default=1, metavar="N", help="of each motion; default: 1"
@@ -170,12 +176,16 @@ def _blind_make(action: argparse.ArgumentParser) -> None:
             help=f"cases {told}, by robot",
         )
     action.add_argument(
-        "--seed", required=True, metavar="KEY", help="any text; it tells the key, so conceal it"
+        "--seed",
+        required=True,
+        metavar="KEY",
+        help="any text of 16 characters or more; it tells the key, so conceal it",
     )
     out(action, "the cases and commitment.json; it may hold nothing else")
     action.add_argument(
         "--key", type=Path, required=True, metavar="FILE", help="where the truth goes; conceal it"
     )
+    place(action)
 
 
 def _blind_run(action: argparse.ArgumentParser) -> None:

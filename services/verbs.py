@@ -268,26 +268,14 @@ def _export(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _record(options: argparse.Namespace) -> dict[str, Any]:
-    from pup.sysid.virtual import SensorNoise, record
+    from services.record import scripted, virtual
 
-    if not options.virtual:
-        raise InputError("only virtual robots can be recorded by now; add --virtual")
     robot = RobotDescription.load(options.robot)
     truth = options.truth
     if truth is not None and truth.is_dir():
         raise InputError(f"{truth}: is a folder; --truth needs a file")
     with _folder(options.out) as out, _folder(truth.parent if truth else out):
-        made = record(
-            robot,
-            options.motions,
-            out,
-            options.seed,
-            actuator=options.actuator or robot.actuator,
-            noise=SensorNoise(0.0, 0.0, 0.0, 0.0) if options.noiseless else SensorNoise(),
-            repeats=options.repeats,
-            truth=truth,
-        )
-    return {"recordings": [str(out / f"{r.id}.parquet") for r in made]}
+        return (scripted if options.scripts else virtual)(options, robot, out)
 
 
 def _blind(options: argparse.Namespace) -> dict[str, Any]:

@@ -132,10 +132,23 @@ def _(place: Place) -> Made:
     return place.record("standup"), ("'standup'", "darwin_leg", "can play step")
 
 
-@case("a recording of a real robot")
+@case("a recording without a word of who plays")
 def _(place: Place) -> Made:
     command = ["record", "step", "--robot", "darwin_leg", "--out", place.out]
-    return command, ("add --virtual",)
+    return command, ("--virtual", "--scripts")
+
+
+@case("scripts that are repeated")
+def _(place: Place) -> Made:
+    command = ["record", "step", "--scripts", "--robot", "darwin_leg", "--out", place.out]
+    return [*command, "--repeats", 2], ("--repeats", "`pup-agent play` has one of its own")
+
+
+@case("scripts in a folder of other files")
+def _(place: Place) -> Made:
+    command = ["record", "step:0.1", "--scripts", "--robot", "darwin_leg", "--out", place.here]
+    place.write("other.json", "{}")
+    return command, ("holds other files (other.json)",)
 
 
 @case("a truth that is a folder")

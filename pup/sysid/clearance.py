@@ -32,6 +32,7 @@ class Clearance:
         self._model.geom_margin[:] = distance / 2  # the margins of the two geoms add up
         self._data = mujoco.MjData(self._model)
         self._qpos = compiled.qpos
+        self._named = [np.zeros(len(robot.joints)), *map(np.array, robot.poses.values())]
         fixed = self._model.body_weldid == 0
         self._fixed_geom = fixed[self._model.geom_bodyid] & robot.floating
 
@@ -48,3 +49,16 @@ class Clearance:
         """Whether nothing touches on the straight line between two poses, both included."""
         count = 1 + int(np.ceil(np.abs(end - start).max() / STRIDE))
         return all(self.free(start + s * (end - start)) for s in np.linspace(0, 1, count + 1))
+
+    def way(self, start: Array, end: Array) -> tuple[Array, ...]:
+        """Poses on the way to the end, which is the last of them.
+
+        Straight where nothing touches, else by zero or a named pose of the robot; straight all the
+        same where that does not help.
+        """
+        if self.path_free(start, end):
+            return (end,)
+        for between in self._named:
+            if self.path_free(start, between) and self.path_free(between, end):
+                return between, end
+        return (end,)

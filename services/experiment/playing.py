@@ -2,7 +2,8 @@
 
 The robot is a process of its own. On its pseudo-terminals works the part of the agent that owns a
 robot (`hardware_agent.body`): ROBOTIS' SDK, the BNO055's protocol, limits and rules of safety, tick
-by tick as in a trial. Only the agent's daemon is left out, which takes walks alone.
+by tick as in a trial. Only the agent's daemon is left out: whoever plays steers time here, and the
+hand that puts the robot down.
 """
 
 import math
@@ -10,7 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,7 +162,7 @@ class Player:
         self._stay(pose, STEADY, name)
         if hold == "hand":  # which would else hold on to one that moves
             self._say(cmd="release")
-        for goal in self._way(pose, motion.target[0]):
+        for goal in self._clearance.way(pose, motion.target[0]):
             for share in np.arange(PERIOD, WAY + 1e-9, PERIOD) / WAY:
                 self._tick(pose + share * (goal - pose), PERIOD, name)
             pose = goal
@@ -219,16 +220,6 @@ class Player:
 
     def _say(self, **command: Any) -> None:
         say(self.doors.side, command)
-
-    def _way(self, start: Array, end: Array) -> Sequence[Array]:
-        """Poses to the end: straight where the robot does not touch itself, else by a named one."""
-        if self._clearance.path_free(start, end):
-            return (end,)
-        for between in map(np.array, (np.zeros_like(end), *self.robot.poses.values())):
-            free = self._clearance.path_free
-            if free(start, between) and free(between, end):
-                return between, end
-        return (end,)
 
 
 def _tilted(row: Row) -> bool:

@@ -1,0 +1,119 @@
+"""Scripts one after the other, with whoever stands at the robot at the keys."""
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from hardware_agent.control import say
+from hardware_agent.prompt import ENTER, LOOK, LeftError, key_pressed, keys, leaving
+from pup.errors import InputError
+from pup.script import Script
+
+HELP = "ENTER goes on, s skips a script, q leaves; any other key, Ctrl-C too, STOPS the robot"
+GROUND = "put the robot on its feet in this pose and let go; ENTER plays"
+STOPPED = "stopped by the operator"
+
+
+class _Ended(Exception):  # noqa: N818
+    """The operator ends it: by leaving, or by a stop."""
+
+
+def play(socket: Path, files: Sequence[Path], repeats: int, auto: bool) -> int:
+    """Play scripts and tell where their recordings are.
+
+    A robot that moves when the terminal is lost is stopped: nobody could any more.
+
+    Args:
+      socket: of the agent.
+      files: of the scripts.
+      repeats: how often each is played.
+      auto: whether nobody is asked: for robots that are not there.
+
+    Returns:
+      0 where all were played or skipped, 1 where the operator ended it or one was stopped.
+
+    Raises:
+      InputError: no agent answers, it refuses, a file is no script, or this is no terminal.
+    """
+    if not auto and not sys.stdin.isatty():
+        raise InputError("this is no terminal; --auto plays without questions")
+    wanted = [(file.absolute(), Script.read(file)) for file in files for _ in range(repeats)]
+    with _stopping(socket), nullcontext() if auto else keys():
+        if not auto:
+            print(HELP, flush=True)
+        try:
+            for file, script in wanted:
+                _one(socket, file, script, auto)
+        except _Ended as error:
+            print(error, file=sys.stderr)
+            return 1
+    return 0
+
+
+def _one(socket: Path, file: Path, script: Script, auto: bool) -> None:
+    print(f"{script.id}: {script.motion}, {script.support}, {script.duration:.1f} s", flush=True)
+    if not auto and not _agreed(socket, moved=False):
+        return
+    say(socket, {"do": "pose", "script": str(file)})
+    told = _until(socket, ("ready", ""), auto)
+    if told["stage"] == "ready":
+        if not auto and script.support == "ground":
+            print(GROUND, flush=True)
+            _agreed(socket, moved=True)
+        say(socket, {"do": "play"})
+        told = _until(socket, ("",), auto)
+    result = told["result"]
+    if "recording" not in result:
+        raise _Ended(f"{script.id}: {result.get('reason', 'it ended')}")
+    print(result["recording"], flush=True)
+
+
+def _agreed(socket: Path, moved: bool) -> bool:
+    """Wait for ENTER; false where the script is to be skipped. Any other key stops the robot.
+
+    Args:
+      socket: of the agent.
+      moved: whether the robot is in the script's first pose by now, and no longer to be left.
+    """
+    while (key := key_pressed()) not in ENTER:
+        if key == "s" and not moved:
+            return False
+        if key == "q" and not moved:
+            raise _Ended("left")
+        if key:
+            _stop(socket)
+    return True
+
+
+def _until(socket: Path, stages: Sequence[str], auto: bool) -> dict[str, Any]:
+    """Wait for a stage; any key stops the robot meanwhile."""
+    while True:
+        told: dict[str, Any] = say(socket, {"do": "health"})["script"]
+        if told["stage"] in stages:
+            return told
+        if auto:
+            time.sleep(LOOK)
+        elif key_pressed():
+            _stop(socket)
+
+
+def _stop(socket: Path) -> None:
+    told = say(socket, {"do": "stop", "reason": "by the operator"})
+    if not told["limp"]:
+        raise _Ended("NOT EVERY SERVO SAYS THAT IT IS LIMP: use the power switch")
+    raise _Ended(STOPPED)
+
+
+@contextmanager
+def _stopping(socket: Path) -> Iterator[None]:
+    """Stop a robot that moves by a script when whoever plays it is gone."""
+    try:
+        with leaving():
+            yield
+    except (LeftError, OSError, KeyboardInterrupt) as error:
+        if say(socket, {"do": "health"})["script"]["stage"]:
+            say(socket, {"do": "stop", "reason": "the operator's terminal is gone"})
+        raise KeyboardInterrupt from error

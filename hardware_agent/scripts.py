@@ -1,0 +1,119 @@
+"""Scripts that whoever stands at the robot lets it play, and their recordings."""
+
+import logging
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hardware_agent.activities import Played, Ready
+from hardware_agent.motion import Motion
+from hardware_agent.rollout import columns_of
+from hardware_agent.status import brief
+from pup.errors import InputError
+from pup.recording import Recording
+from pup.robot import RobotDescription
+from pup.script import Script
+
+log = logging.getLogger("pup-agent")
+
+
+class Stage(StrEnum):
+    """Where the script is that was asked for last."""
+
+    NONE = ""
+    POSING = "posing"
+    READY = "ready"
+    PLAYING = "playing"
+
+
+class Scripts:
+    """Plays scripts, in the agent's main thread.
+
+    Args:
+      robot: who plays them.
+      motion: the control loop.
+      folder: of the recordings.
+      source: of them, `hardware` or `simulation`.
+    """
+
+    def __init__(self, robot: RobotDescription, motion: Motion, folder: Path, source: str) -> None:
+        self._robot, self._motion = robot, motion
+        self._folder, self._source = folder, source
+        self._script: Script | None = None
+        self._stage = Stage.NONE
+        self._result: dict[str, str] = {}
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The script's name and stage, and what became of the one before, for `health`."""
+        name = None if self._script is None else self._script.name
+        return {"name": name, "stage": str(self._stage), "result": self._result}
+
+    def pose(self, file: object, stopped: Callable[[], bool]) -> None:
+        """Let the robot go to a script's first pose.
+
+        Args:
+          file: the script's.
+          stopped: whether somebody has stopped the robot since this was asked for.
+
+        Raises:
+          InputError: it is no script of this robot, or cannot be played now.
+        """
+        if not isinstance(file, str):
+            raise InputError("'script' is no path of a file")
+        script = Script.read(Path(file))
+        if script.robot != self._robot.name or script.joints != self._robot.joint_names:
+            raise InputError(f"{file}: is for {script.robot!r}, or for other joints than here")
+        refused = self._motion.pose(script, stopped)
+        if refused is not None:
+            raise InputError(refused.reason)
+        self._script, self._stage, self._result = script, Stage.POSING, {}
+
+    def play(self, stopped: Callable[[], bool]) -> None:
+        """Play it.
+
+        Raises:
+          InputError: none waits for that.
+        """
+        refused = self._motion.play(stopped)
+        if refused is not None:
+            raise InputError(refused.reason)
+        self._stage = Stage.PLAYING
+
+    def handle(self, event: Ready | Played) -> None:
+        """Something happened in the control loop."""
+        if isinstance(event, Ready):
+            self._stage = Stage.READY if self._stage is Stage.POSING else self._stage
+            return
+        self._result = {"reason": event.reason} if event.reason else self._keep(event)
+        self._script, self._stage = None, Stage.NONE  # last: who waits for it reads the result
+        log.info("script %s: %s", event.script.name, ", ".join(self._result.values()))
+
+    def _keep(self, event: Played) -> dict[str, str]:
+        """Write the recording; a script that is played again repeats its first."""
+        script, rows = event.script, np.array([row.values for row in event.rows])
+        names = [script.name, *(f"{script.name}_again_{n}" for n in range(1, 1000))]
+        free = next((n for n in names if not self._file(n).exists()), None)
+        if free is None:
+            return {"reason": "recorded a thousand times already; move the recordings away"}
+        try:
+            made = Recording(
+                id=free,
+                robot=script.robot,
+                motion=script.motion,
+                support=script.support,
+                source=self._source,
+                **columns_of(rows, script.joints),
+                repeat_of=None if free == script.name else script.name,
+                notes="played by pup-agent",
+            )
+            made.write(self._file(free))
+        except (OSError, InputError) as error:
+            return {"reason": f"the recording is lost: {brief(str(error))}"}
+        return {"recording": str(self._file(free))}
+
+    def _file(self, name: str) -> Path:
+        return self._folder / f"{name}.parquet"
