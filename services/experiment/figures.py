@@ -54,6 +54,12 @@ METHODS = tuple(COLOURS)
 FURTHER = {"own": PURPLE, "corrected": GREEN}
 """Colours of policies that were trained on."""
 DASHES = {"prior": "--", "diagnosed": ":"}
+MODELS = {
+    "nominal": "PD",
+    "nn_pd": "NN-PD",
+    "residual_network": "PD and a residual network",
+    "diagnosed": "diagnosed",
+}
 QUANTITIES = {"distance": "distance, m", "time": "time before the fall, s"}
 
 
@@ -232,16 +238,23 @@ def held_out(models: Mapping[str, Any]) -> Drawing:
     """
     names = list(models)
     motions = sorted({m for told in models.values() for m in told["per_motion"]})
-    figure = new_figure(WIDTH, 1.2 + 0.3 * (1 + len(motions)) * max(1, len(names)) / 2)
+    rows = ["all", *motions] if len(motions) > 1 else motions
+    figure = new_figure(WIDTH, 1.2 + 0.3 * len(rows) * max(1, len(names)) / 2)
     axes = figure.subplots()
     colours = dict(zip(names, (SOFT, BLUE, AMBER, GREEN, PURPLE), strict=False))
     height = 0.8 / len(names)
     for k, name in enumerate(names):
         told = models[name]
-        values = [told["rmse"], *(told["per_motion"].get(m, np.nan) for m in motions)]
+        values = [(told["per_motion"] | {"all": told["rmse"]}).get(row, np.nan) for row in rows]
         at = np.arange(len(values)) - 0.4 + (k + 0.5) * height
-        axes.barh(at, 1e3 * np.array(values, float), height * 0.9, color=colours[name], label=name)
-    _rows(axes, ["all", *motions])
+        axes.barh(
+            at,
+            1e3 * np.array(values, float),
+            height * 0.9,
+            color=colours[name],
+            label=MODELS.get(name, name),
+        )
+    _rows(axes, rows)
     axes.set_xlabel("error on motions left out, mrad")
     axes.grid(axis="x")
     figure.legend(loc="outside upper left", ncols=2, fontsize=8)

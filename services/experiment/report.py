@@ -48,8 +48,9 @@ def _content(told: Mapping[str, Any]) -> Iterator[Html]:
         "ZeroMQ. Intervals are 90 %, of robots drawn with replacement.",
         class_="lead",
     )
-    yield tag("h2", "What was to be shown")
-    yield from _acceptance(told)
+    if any(part["walks"] for part in told["directions"].values()) or told["diagnosis"]["robots"]:
+        yield tag("h2", "What was to be shown")
+        yield from _acceptance(told)
     for direction, part in told["directions"].items():
         if not part["walks"]:
             continue
