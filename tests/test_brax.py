@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from biped import biped, biped_bounds
 from commandline import pup
+from test_simulator import recording
 
 from pup.errors import InputError
 from pup.locomotion.sampling import ParameterSampler
@@ -155,8 +156,10 @@ def test_a_servo_moves_as_in_mujoco() -> None:
         candidates.values[3, candidates.index[name]] = 1e15
     first, second = commanded(BENCH, SECOND, 1), commanded(BENCH, 0.6, 2)
     enabled = (np.arange(len(first.time)) % 9 > 1).astype(float)
+    fast = np.arange(0, 0.2, 0.0007)  # commands, more than one in a sub-step
     runs = [
         replace(first, extras={"torque_enabled": enabled}),
+        recording(BENCH, fast, np.sin(20 * fast), 0.1, id="fast"),
         replace(second, setup={"mass": 0.5, "length": 0.15, "vin": 5.0}),
     ]
     mujoco, brax = both(BENCH, runs, candidates, "pd")

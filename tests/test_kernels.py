@@ -76,22 +76,28 @@ def test_before_anything_has_acted_a_limit_is_met_by_the_velocity_that_is() -> N
 
 
 @pytest.mark.parametrize("width", [1, 2])
-def test_a_command_holds_from_its_time_on(width: int) -> None:
+@pytest.mark.parametrize("rate", [0.0081, 0.0007])
+def test_a_command_holds_from_its_time_on(rate: float, width: int) -> None:
+    """Slower or faster than sub-steps; of what held before the last one counts the mean."""
     rng = np.random.default_rng(0)
-    ticks = np.arange(5) * 0.0081
+    ticks = np.arange(5) * rate
     times = np.stack([np.append(ticks, np.inf), np.append(1.3 * ticks, np.inf)])
     commands = rng.uniform(size=(12, 2))
     cells = np.arange(21) * 0.002
     newest = np.stack([np.searchsorted(row, cells, "right") - 1 for row in times])
-    asked = rng.uniform(-0.01, 0.05, (2, 4 * width))
-    asked[0, 0] = times[0, 2]
-    held, told = np.empty((2, 8)), np.empty(asked.shape)
-    kernels.look_up(held, told, asked, commands, times, newest, 0.002)
+    end = rng.uniform(-0.01, 6 * rate, (2, 4 * width))
+    end[0, 0] = times[0, 2]
+    now, before, share = (np.empty((2, 8)) for _ in range(3))
+    kernels.look_up(now, before, share, end - 0.002, end, commands, times, newest, 0.002)
+    fine = (np.arange(2000) + 0.5) * 1e-6
     for i, row in enumerate(times):
-        since = np.maximum(np.searchsorted(row, asked[i], "right") - 1, 0)
-        np.testing.assert_array_equal(told[i], row[since])
-        by_joint = np.repeat(since, 2 // width)
-        np.testing.assert_array_equal(held[i], commands[6 * i + by_joint, np.arange(8) % 2])
+        for k, at in enumerate(np.repeat(end[i], 2 // width)):
+            held = np.maximum(np.searchsorted(row, [at, *(at - fine)], "right") - 1, 0)
+            told = commands[6 * i + held, k % 2]
+            assert now[i, k] == told[0]
+            mean = share[i, k] * now[i, k] + (1 - share[i, k]) * before[i, k]
+            assert mean == pytest.approx(told[1:].mean(), abs=1e-3)
+            assert share[i, k] == pytest.approx((held[1:] == held[0]).mean(), abs=1e-3)
 
 
 def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path) -> None:

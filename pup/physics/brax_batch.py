@@ -11,6 +11,7 @@ from pup.errors import InputError
 from pup.physics.actuators import PD, NetworkPD
 from pup.physics.brax_engine import Bodies, Fields, System, fields_of, jax, jnp, move, put_system
 from pup.physics.brax_servos import Last, Law, Servos, law_of
+from pup.physics.commands import Commands
 from pup.physics.model import Model
 from pup.physics.mujoco_batch import Group, MujocoSimulator, Run
 from pup.physics.parameters import Candidates
@@ -34,21 +35,44 @@ class _Orders(NamedTuple):
     Attributes:
       time: when the recordings' commands are given, shape (n_recordings, n_commands), s.
       held: the commands, shape (n_recordings, n_commands, n_joints), rad.
+      area: what they come to until each, same shape, rad s.
       recording: that each simulation follows, shape (n,).
       delay: by which commands come late to each, shape (n, 1), s.
     """
 
     time: Any
     held: Any
+    area: Any
     recording: Any
     delay: Any
 
-    def at(self, time: Any) -> tuple[Any, Any]:
-        """What is held at a time, shape (n, n_joints), and since when, shape (n, 1)."""
+    @classmethod
+    def of(cls, commands: Commands, recording: Any, delay: Any) -> "_Orders":
+        """The orders of simulations that follow some recordings late."""
+        ends = np.where(np.isfinite(commands.time), commands.time, 0.0)
+        spans = np.maximum(np.diff(ends), 0.0)[:, :, None]
+        area = np.cumsum(commands.held[:, :-1] * spans, axis=1)
+        area = np.concatenate([np.zeros_like(area[:, :1]), area], axis=1)
+        return cls(commands.time, commands.held, area, recording, delay)
+
+    def between(self, start: Any, end: Any) -> tuple[Any, Any, Any]:
+        """What is held at a sub-step's end, (n, n_joints), on the average before, and since when.
+
+        See `kernels.look_up`.
+        """
+        start, end = start - self.delay, end - self.delay
+        (last, since), (first, told) = self._row(end), self._row(start)
+        now, then = (self.held[self.recording, row] for row in (last, first))
+        whole = self.area[self.recording, last] - self.area[self.recording, first]
+        mean = (whole - then * (start - told)) / (since - start)
+        return now, jnp.where((last - first > 1)[:, None], mean, then), since + self.delay
+
+    def _row(self, time: Any) -> tuple[Any, Any]:
+        """Which commands are held at times (n, 1), shape (n,), and since when, shape (n, 1)."""
         told = self.time[self.recording]
-        count = jax.vmap(partial(jnp.searchsorted, side="right"))(told, time - self.delay)
+        count = jax.vmap(partial(jnp.searchsorted, side="right"))(told, time)
         row = jnp.maximum(count[:, 0] - 1, 0)
-        return self.held[self.recording, row], self.time[self.recording, row][:, None]
+        return row, self.time[self.recording, row][:, None]
 
 
 class _Course(NamedTuple):
@@ -157,8 +181,8 @@ class _BraxRun(Run):
         bodies = Bodies(self.qpos, self.qvel, np.zeros_like(self.qvel))
         course = bodies, Last(nothing, nothing, nothing), self.broken
         (fields, servos), orders, (bodies, last, broken) = self._spread((each, orders, course))
-        commands = group.commands.time, group.commands.held
-        self.fixed = jax.device_put((fields, servos, _Orders(*commands, *orders)))
+        told = _Orders.of(group.commands, *orders)
+        self.fixed = jax.device_put((fields, servos, told))
         self.course = jax.device_put(_Course(bodies, last, np.array(0), broken))
 
     def _spread(self, tree: Any) -> Any:
@@ -198,8 +222,8 @@ def _march(
         position, velocity = bodies.qpos[:, model.qpos], bodies.qvel[:, model.dofs]
         outside = law.outside(servos, course.last, velocity)
         end = (course.step + 0.5) * timestep
-        (now, since), (before, _) = orders.at(end), orders.at(end - timestep)
-        share = jnp.clip((end - orders.delay - since) / timestep, 0, 1)
+        now, before, since = orders.between(end - timestep, end)
+        share = jnp.clip((end - since) / timestep, 0, 1)
         share = jnp.where(now == before, 1.0, share)
         answers = [law.answer(servos, to - position, velocity, outside) for to in (now, before)]
         torque, damping = (

@@ -2,8 +2,9 @@
 
 Sub-step n lasts, for what drives it, from n - 1/2 to n + 1/2 (see `simulator`). A command that
 changes within it leaves two targets, the second for a share of it: a servo at its limit answers to
-each in turn, not to their mean. Commands may come late, by a time of its own for each simulation
-and joint, without any rounding to sub-steps.
+each in turn, not to their mean. Of more changes, the first target is the mean until the last one.
+Commands may come late, by a time of its own for each simulation and joint, without any rounding to
+sub-steps.
 """
 
 from abc import ABC, abstractmethod
@@ -26,7 +27,7 @@ class Target:
 
     Attributes:
       now: target at its end, shape (n_recordings, n_candidates or 1, n_joints), rad.
-      before: target at its beginning; None where no recording's changes.
+      before: target from its beginning until then; None where no recording's changes.
       share: of the sub-step for which `now` holds, broadcastable to them.
     """
 
@@ -49,25 +50,14 @@ class HeldCommands(ABC):
           running: recordings that have not ended, the first ones.
         """
 
+    @abstractmethod
     def late(self, step: int | Array, lateness: Array) -> Target:
         """Targets that arrive late.
 
         Args:
-          step: the sub-step; where simulations have one each, shape (n_simulations, 1, 1).
+          step: the sub-step; where simulations have one each, shape (n_simulations, 1).
           lateness: shape (n_recordings, n_candidates, n_joints or 1), s; negative for early.
         """
-        end = (step + 0.5) * self.timestep - lateness
-        now, told = self._held_at(end)
-        since = (end - told) / self.timestep
-        if (since >= 1).all():  # what is held now has been held since the sub-step's beginning
-            return Target(now, None, _ONE)
-        before, _ = self._held_at((step - 0.5) * self.timestep - lateness)
-        share = np.where(now == before, 1.0, np.minimum(np.maximum(since, 0), 1))
-        return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
-
-    @abstractmethod
-    def _held_at(self, time: Array) -> tuple[Array, Array]:
-        """What is held at some times, and since when."""
 
 
 class Commands(HeldCommands):
@@ -102,9 +92,9 @@ class Commands(HeldCommands):
         first = np.arange(len(plans)) * ticks
         self._flat = self.held.reshape(-1, joints)
         self._at, self._from = first + rows[1:], first + rows[:-1]
+        self._mean_before(rows[1:] - rows[:-1] > 1)
         since = (ends[1:, None] - np.take_along_axis(self.time.T, rows[1:], axis=0)) / timestep
-        recordings = np.arange(len(plans))
-        changed = self.held[recordings, rows[1:]] != self.held[recordings, rows[:-1]]
+        changed = self._flat[self._at] != self._flat[self._from]
         self._share = np.where(changed.any(axis=2), np.clip(since, 0, 1), 1.0)
         self._changes = (self._share < 1).cumsum(axis=1)
 
@@ -117,20 +107,41 @@ class Commands(HeldCommands):
         share = np.where(now == before, 1.0, self._share[step, :running, None, None])
         return Target(now, before, share)
 
-    def _held_at(self, time: Array) -> tuple[Array, Array]:
-        recordings, candidates, _ = time.shape
-        flat, told = time.reshape(recordings, -1), np.empty(time.shape)
-        held = np.empty((recordings, candidates, self._flat.shape[1]))
+    def late(self, step: int | Array, lateness: Array) -> Target:
+        """See HeldCommands; all recordings are at the same sub-step."""
+        now, before, share = self._looked_up(0, step, lateness)
+        return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
+
+    def _looked_up(
+        self, first: int, step: int | Array, lateness: Array
+    ) -> tuple[Array, Array, Array]:
+        """Targets of as many recordings as `lateness` has rows; see kernels.look_up and `late`."""
+        start, end = ((step + half) * self.timestep - lateness for half in (-0.5, 0.5))
+        recordings, candidates, _ = lateness.shape
+        ticks, joints = self.held.shape[1:]
+        found = np.empty((3, recordings, candidates, joints))
+        now, before, share = found.reshape(3, recordings, -1)
         kernels.look_up(
-            held.reshape(recordings, -1),
-            told.reshape(recordings, -1),
-            flat,
-            self._flat,
-            self.time,
-            self._last,
+            now,
+            before,
+            share,
+            start.reshape(recordings, -1),
+            end.reshape(recordings, -1),
+            self._flat[first * ticks :],
+            self.time[first:],
+            self._last[first:],
             self.timestep,
         )
-        return held, told
+        return found[0], found[1], found[2]
+
+    def _mean_before(self, dense: NDArray[np.bool_]) -> None:
+        """Let sub-steps (n_steps, n_recordings) with several commands begin with a mean of them."""
+        for row in np.flatnonzero(dense.any(axis=0)):
+            steps = np.flatnonzero(dense[:, row])
+            at, on_time = steps[:, None].astype(float), np.zeros((1, len(steps), 1))
+            _, means, _ = self._looked_up(int(row), at, on_time)
+            self._from[steps, row] = len(self._flat) + np.arange(len(steps))
+            self._flat = np.concatenate([self._flat, means[0]])
 
 
 class LiveCommands(HeldCommands):
@@ -176,10 +187,19 @@ class LiveCommands(HeldCommands):
         return Target(self.held[:, 0], None, _ONE)
 
     def late(self, step: int | Array, lateness: Array) -> Target:
-        """See HeldCommands; a command never comes before it is told."""
-        return super().late(np.asarray(step)[:, :, None], np.maximum(lateness, 0.0))
+        """See HeldCommands; a command never comes before it is told, one in a sub-step."""
+        step, lateness = np.asarray(step)[:, :, None], np.maximum(lateness, 0.0)
+        end = (step + 0.5) * self.timestep - lateness
+        now, told = self._held_at(end)
+        since = (end - told) / self.timestep
+        if (since >= 1).all():  # what is held now has been held since the sub-step's beginning
+            return Target(now, None, _ONE)
+        before, _ = self._held_at((step - 0.5) * self.timestep - lateness)
+        share = np.where(now == before, 1.0, np.minimum(np.maximum(since, 0), 1))
+        return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
 
     def _held_at(self, time: Array) -> tuple[Array, Array]:
+        """What is held at some times, and since when."""
         age = (time < self.told[:, :-1, None]).sum(axis=1, keepdims=True)
         told = np.take_along_axis(self.told[:, :, None], age, axis=1)
         return np.take_along_axis(self.held, age, axis=1), told

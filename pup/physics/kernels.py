@@ -189,33 +189,48 @@ def split(
 
 @kernel
 def look_up(
-    held: Array,
-    told: Array,
-    time: Array,
+    now: Array,
+    before: Array,
+    share: Array,
+    start: Array,
+    end: Array,
     commands: Array,
     times: Array,
     newest: Index,
     timestep: float,
 ) -> None:
-    """What commands are held at some times, and since when; a row is a recording here.
+    """What commands are held between two times; a row is a recording here.
 
     Args:
-      held: what is, rad, (n_recordings, n_candidates * n_joints); written.
-      told: since when, s; written.
-      time: when, s; like `told` as many columns as `held`, or one for all joints of a candidate.
+      now: what is at the end, rad, (n_recordings, n_candidates * n_joints); written.
+      before: what was until the last change, on the average; written.
+      share: of the time for which `now` has been held; written.
+      start: of the time, s; as many columns as `now`, or one for all joints of a candidate.
+      end: s; the same, a timestep later.
       commands: of all recordings, one after the other, (n_recordings * n_commands, n_joints), rad.
       times: since when they hold, (n_recordings, n_commands), s; infinite behind the last.
       newest: which was the newest at each sub-step, (n_recordings, n_steps).
       timestep: s.
     """
     joints, last = commands.shape[1], newest.shape[1] - 1
-    width = held.shape[1] // time.shape[1]
-    for i in range(time.shape[0]):
-        for k in range(time.shape[1]):
-            at = time[i, k]
-            row = newest[i, min(max(int(at / timestep), 0), last)]
-            if times[i, row + 1] <= at:
+    width = now.shape[1] // end.shape[1]
+    for i in range(end.shape[0]):
+        for k in range(end.shape[1]):
+            row = newest[i, min(max(int(end[i, k] / timestep), 0), last)]
+            while times[i, row + 1] <= end[i, k]:
                 row += 1
-            told[i, k] = times[i, row]
+            first = row
+            while first > 0 and times[i, first] > start[i, k]:
+                first -= 1
+            since = min(max((end[i, k] - times[i, row]) / timestep, 0.0), 1.0)
+            own = i * times.shape[1]
             for c in range(k * width, (k + 1) * width):
-                held[i, c] = commands[i * times.shape[1] + row, c % joints]
+                told, then = commands[own + row, c % joints], commands[own + first, c % joints]
+                if row - first > 1:
+                    more = (then - told) * (times[i, first + 1] - start[i, k])
+                    for r in range(first + 1, row):
+                        off = commands[own + r, c % joints] - told
+                        more += off * (times[i, r + 1] - times[i, r])
+                    then = told + more / (times[i, row] - start[i, k])
+                now[i, c], before[i, c] = told, then
+                share[i, c] = 1.0 if told == then else since
