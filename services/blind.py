@@ -1,15 +1,17 @@
 """The blind jobs: make a sealed set of concealed cases, diagnose it, and score the verdicts."""
 
 import argparse
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from pup.blind.make import make_set
+from pup.blind.make import Order, make_set
 from pup.blind.seal import read_set
 from pup.errors import InputError
 from pup.files import write_atomic, write_json
 from services import places
-from services.blind_journal import JOURNAL, SAME_SET, Journal, read_journal
+from services.blind_journal import JOURNAL, SAME_SET, Journal, doubts, read_journal
 from services.progress import counted
 
 
@@ -19,6 +21,18 @@ def make(options: argparse.Namespace) -> dict[str, Any]:
     Returns:
       The commitment.
     """
+
+    def each(
+        job: Callable[[Order], str], orders: Sequence[Order]
+    ) -> Generator[tuple[Order, Any], None, None]:
+        if not orders:
+            return
+        with places.cases(options) as (pools, _), closing(pools(job)) as pool:
+            for order in orders:
+                pool.begin(order)
+            for _ in orders:
+                yield pool.settled()
+
     with counted("blind make") as tell:
         return make_set(
             dict(options.robot),
@@ -27,6 +41,7 @@ def make(options: argparse.Namespace) -> dict[str, Any]:
             options.out,
             options.key,
             lambda id, done, total: tell(done, total),
+            each,
         )
 
 
@@ -68,6 +83,7 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
         only = None if options.limit is None else first
         scores = score_set(options.set, options.key, options.diagnoses, replayed, only, tell)
     scores["engine"] = journal["engine"] if journal else None
+    scores["doubts"] = list(doubts(options.diagnoses, journal, commitment)) if journal else []
     write_json(options.out, scores)
     page = markdown(scores)
     write_atomic(table, page)

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pup.blind.score import DIAGNOSIS
 from pup.errors import InputError
-from pup.files import read_json, write_json
-from services.provenance import engine, now
+from pup.files import read_json, sha256, write_json
+from services.provenance import ALSO, engine, now
 
 JOURNAL = "run.json"
 SAME_SET = ("key_sha256", "recordings_sha256")
@@ -32,7 +33,7 @@ class Journal:
 
     def __init__(self, folder: Path, commitment: Mapping[str, Any]) -> None:
         self.folder = folder
-        self.engine = engine()
+        self.engine = engine(ALSO)
         of_set = {name: commitment.get(name) for name in SAME_SET}
         told = read_journal(folder)
         if told is None:
@@ -76,13 +77,19 @@ class Journal:
             yield
         finally:
             # Processes started later than this one have imported what stood there then.
-            changed = engine()["source_sha256"] != self.engine["source_sha256"]
+            changed = engine(ALSO)["source_sha256"] != self.engine["source_sha256"]
             session |= {
                 "ended": now(),
                 "source_changed": changed,
                 "failed": dict(sorted(failed.items())),
             }
             self._write()
+
+    def seal(self, case: str) -> None:
+        """Note the digest of a case's diagnosis, just written."""
+        digests = self._told.setdefault("diagnoses", {})
+        digests[case] = sha256(self.folder / case / DIAGNOSIS)
+        self._write()
 
     def _write(self) -> None:
         write_json(self.folder / JOURNAL, self._told)
@@ -106,3 +113,29 @@ def read_journal(folder: Path) -> dict[str, Any] | None:
     ):
         raise InputError(f"{file}: not the journal of a run over a blind set (schema 1)")
     return told
+
+
+def doubts(
+    folder: Path, journal: Mapping[str, Any], commitment: Mapping[str, Any]
+) -> Iterator[str]:
+    """What in a folder of diagnoses is not as a proof has it, a line each.
+
+    Args:
+      folder: of the diagnoses.
+      journal: its journal; what one of an earlier run does not tell is not checked.
+      commitment: of the set.
+    """
+    frozen, sessions = commitment.get("engine_git_sha"), journal["sessions"]
+    by = {journal["engine"].get("git_sha"), *(session.get("git_sha") for session in sessions)}
+    others = sorted(str(sha) for sha in by - {None, frozen})
+    if frozen and others:
+        yield f"The set is committed to engine {frozen}; diagnosed by {', '.join(others)}."
+    if any(session.get("source_changed") for session in sessions):
+        yield "Files of the engine were changed while it diagnosed."
+    edited = [
+        case
+        for case, digest in journal.get("diagnoses", {}).items()
+        if (folder / case / DIAGNOSIS).is_file() and sha256(folder / case / DIAGNOSIS) != digest
+    ]
+    if edited:
+        yield f"Edited since they were written: the diagnoses of {', '.join(sorted(edited))}."

@@ -118,6 +118,8 @@ def run_cases(
             told = _settled(order, outcome)
             if told.error:
                 failed[order.name] = told.error
+            else:
+                journal.seal(order.name)
             done += not told.error
             share += order.weight / max(whole, 1)
             tell(done, len(wanted), _note(order, told, failed), share)

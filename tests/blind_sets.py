@@ -81,7 +81,8 @@ def sealed(folder: Path, cases: Mapping[str, Mapping[str, float]]) -> Path:
     """Seal what stands in `set`."""
     truths = [truth(name, missing) for name, missing in cases.items()]
     write_key(folder / "key.json", {"schema": 1, "salt": "ab", "cases": truths})
-    commit(folder / "set", folder / "key.json", {"servo_bench": len(truths)})
+    (folder / "set").mkdir(exist_ok=True)
+    commit(folder / "set", folder / "key.json")
     return folder / "set"
 
 

@@ -8,21 +8,27 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from commandline import files, pup
+from commandline import files, pup, pup_process
 from scipy.integrate import solve_ivp
 
 from pup.blind.cases import NULLS, STRATA, strata
 from pup.blind.catalogue import CLASS_OF
 from pup.blind.make import make_set
+from pup.blind.origin import generator
 from pup.blind.seal import COMMITMENT, verify
 from pup.blind.sensors import Noise, measure, see
 from pup.blind.simulate import simulate
 from pup.blind.world import Nominal, Plan, World
 from pup.errors import InputError
+from pup.files import read_json, write_json
 from pup.recording import KEY, load_recordings
 from pup.robot import RobotDescription
 
-CASES, NULL_CASES, SEED = {"servo_bench": 1}, {"servo_bench": 1, "darwin_leg": 1}, "open sesame"
+CASES, NULL_CASES = {"servo_bench": 1}, {"servo_bench": 1, "darwin_leg": 1}
+SEED = "open sesame, and shut again"
+
+
+NULLS_ALONE, LONG = {"servo_bench": 2}, "again and again and again"
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +102,18 @@ def test_a_changed_key_is_found_out(made: Path, tmp_path: Path) -> None:
         verify(copy / "set", copy / "key.json")
 
 
+def test_other_counts_than_those_of_the_key_are_found_out(made: Path, tmp_path: Path) -> None:
+    copy = copied(made, tmp_path)
+    told = read_json(copy / "set" / COMMITMENT)
+    write_json(copy / "set" / COMMITMENT, told | {"cases": {"servo_bench": 3}})
+    with pytest.raises(InputError, match="its cases are not those of the key"):
+        verify(copy / "set", copy / "key.json")
+
+
+def test_the_key_names_the_generator(made: Path) -> None:
+    assert read_json(made / "key.json")["generator"] == generator()
+
+
 def test_a_changed_recording_is_found_out(made: Path, tmp_path: Path) -> None:
     copy = copied(made, tmp_path)
     first, second = sorted((copy / "set").glob("case_*/recordings/*.parquet"))[:2]
@@ -110,15 +128,67 @@ def test_the_same_seed_makes_the_same_bytes_and_a_stopped_set_goes_on(tmp_path: 
             if done == stop_after:
                 raise KeyboardInterrupt
 
-        make_set({}, {"servo_bench": 2}, "again", folder / "set", folder / "key", report)
+        make_set({}, NULLS_ALONE, LONG, folder / "set", folder / "key", report)
         return files(folder)
 
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path / "a", stop_after=1)
     (part,) = (p for p in (tmp_path / "a" / "key.parts").iterdir() if p.name != "set.json")
+    assert oct(part.stat().st_mode & 0o777) == "0o600"
     part.unlink()  # as if killed while it was writing this case
-    (tmp_path / "a" / "set" / f"case_{part.stem}" / "recordings" / "r99.parquet").touch()
-    assert make(tmp_path / "a") == make(tmp_path / "b")
+    case = tmp_path / "a" / "set" / f"case_{part.stem}"
+    (case / "recordings" / "r99.parquet").touch()
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "a", stop_after=1)
+    next(case.glob("recordings/*.parquet")).unlink()  # its truth is there, a recording is not
+    whole = make(tmp_path / "b")
+    assert make(tmp_path / "a") == whole
+    assert oct((tmp_path / "b" / "key").stat().st_mode & 0o777) == "0o600"
+
+
+def stopped(folder: Path) -> Path:
+    """What a set leaves that is stopped after its first case: the folder of its parts."""
+
+    def report(id: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_set({}, NULLS_ALONE, LONG, folder / "set", folder / "key", report)
+    return folder / "key.parts"
+
+
+def test_another_generator_does_not_go_on(tmp_path: Path) -> None:
+    plan = stopped(tmp_path) / "set.json"
+    told = read_json(plan)
+    told["generator"]["source_sha256"] = "0"
+    write_json(plan, told)
+    with pytest.raises(InputError, match="another version of the generator"):
+        make_set({}, NULLS_ALONE, LONG, tmp_path / "set", tmp_path / "key")
+
+
+def test_a_folder_of_no_case_is_not_committed_to(tmp_path: Path) -> None:
+    stopped(tmp_path)
+    (tmp_path / "set" / "case_0").mkdir()
+    with pytest.raises(InputError, match="case_0 in it or in its key"):
+        make_set({}, NULLS_ALONE, LONG, tmp_path / "set", tmp_path / "key")
+    assert not (tmp_path / "set" / COMMITMENT).exists()
+
+
+def test_short_seeds_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="16 characters"):
+        make_set({}, NULLS_ALONE, "guess me", tmp_path / "set", tmp_path / "key")
+    assert not files(tmp_path)
+
+
+@pytest.mark.ray
+def test_cases_made_at_once_are_those_made_one_by_one(tmp_path: Path) -> None:
+    for name, how in (("one", ("--local",)), ("two", ("--cores", 2))):
+        where = ("--out", tmp_path / name / "set", "--key", tmp_path / name / "key")
+        order = ("--nulls", "servo_bench=2", "--seed", LONG)
+        done = pup_process("blind", "make", *order, *where, *how)
+        assert done.code == 0, done.err
+        assert "2/2 cases" in done.err
+    assert files(tmp_path / "one") == files(tmp_path / "two")
 
 
 def test_strata_come_in_their_shares() -> None:
@@ -154,13 +224,14 @@ def test_a_null_without_noise_is_the_nominal_model(bench: RobotDescription) -> N
     ("options", "told"),
     [
         (("--robot", "emps=1"), "blind sets are of"),
+        (("--robot", "some/folder=1"), "not known of another robot"),
         ((), "no case asked for"),
         (("--robot", "servo_bench"), "NAME=COUNT"),
         (("--nulls", "servo_bench=-1"), "NAME=COUNT"),
     ],
 )
 def test_a_wrong_order_is_refused(options: tuple[str, ...], told: str, tmp_path: Path) -> None:
-    where = ("--seed", "x", "--out", tmp_path / "set", "--key", tmp_path / "key")
+    where = ("--seed", LONG, "--out", tmp_path / "set", "--key", tmp_path / "key")
     done = pup("blind", "make", *options, *where)
     assert done.code == 2 and told in done.err
     assert not files(tmp_path)
@@ -168,5 +239,5 @@ def test_a_wrong_order_is_refused(options: tuple[str, ...], told: str, tmp_path:
 
 def test_a_key_inside_the_set_is_refused(tmp_path: Path) -> None:
     where = ("--out", tmp_path / "set", "--key", tmp_path / "set" / "key")
-    done = pup("blind", "make", "--nulls", "servo_bench=1", "--seed", "x", *where)
+    done = pup("blind", "make", "--nulls", "servo_bench=1", "--seed", LONG, *where)
     assert done.code == 2 and "outside" in done.err

@@ -247,7 +247,7 @@ def test_without_pysindy_it_is_refused_at_once(
 def test_cases_of_a_made_set(tmp_path: Path) -> None:
     """The whole way, from the concealed truth to the table."""
     pytest.importorskip("pysindy")
-    make_set({"servo_bench": 1}, {"servo_bench": 1}, "rivals", tmp_path / "set",
+    make_set({"servo_bench": 1}, {"servo_bench": 1}, "rivals of one case", tmp_path / "set",
              tmp_path / "key.json", lambda *_: None)  # fmt: skip
     for case in (tmp_path / "set").glob("case_*"):
         document = OURS | {"schema": 1, "robot": "servo_bench"}

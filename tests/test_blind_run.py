@@ -130,6 +130,39 @@ def test_scores_have_the_oracle_ratio_and_both_commits(diagnosed: Path, tmp_path
     assert str(scores["engine"]["git_sha"] or "without a commit") in table
 
 
+def test_what_is_no_proof_is_warned_of(diagnosed: Path, tmp_path: Path) -> None:
+    """An edited verdict, another commit than that committed to, and files changed meanwhile."""
+    copy = shutil.copytree(diagnosed, tmp_path / "copy")
+
+    def warned() -> list[str]:
+        options = ("--set", copy / "set", "--key", copy / "key.json")
+        where = ("--diagnoses", copy / "out", "--out", tmp_path / "scores.json")
+        done = pup("blind", "score", *options, *where, "--json")
+        assert done.code == 0, done.err
+        page = (tmp_path / "scores.md").read_text()
+        assert all(f"Warning: {doubt}" in page for doubt in done.json()["doubts"])
+        return done.json()["doubts"]
+
+    told = journal(copy)
+    assert sorted(told["diagnoses"]) == ["case_0f", "case_1n"]
+    told["sessions"][0]["source_changed"] = False
+    write_json(copy / "out" / "run.json", told)
+    assert warned() == []
+    verdict = read_json(copy / "out" / "case_1n" / "diagnosis.json")
+    write_json(copy / "out" / "case_1n" / "diagnosis.json", verdict | {"verdict": "undetermined"})
+    assert len(warned()) == 1 and "case_1n" in warned()[0]
+    commitment = read_json(copy / "set" / "commitment.json")
+    write_json(copy / "set" / "commitment.json", commitment | {"engine_git_sha": "f" * 40})
+    told["engine"]["git_sha"] = "e" * 40
+    told["sessions"][0]["source_changed"] = True
+    write_json(copy / "out" / "run.json", told)
+    assert len(warned()) == 3
+    assert f"engine {'f' * 40}; diagnosed by" in warned()[0]
+    del told["diagnoses"], told["sessions"][0]["source_changed"]  # as of an earlier run
+    write_json(copy / "out" / "run.json", told)
+    assert len(warned()) == 1
+
+
 def test_the_first_cases_can_be_scored_alone(diagnosed: Path, tmp_path: Path) -> None:
     """As where a run was stopped after `--limit`: the others are not missing."""
     options = ("--set", diagnosed / "set", "--key", diagnosed / "key.json", "--limit", 1)
@@ -225,6 +258,7 @@ def test_the_longest_case_is_the_first(tmp_path: Path) -> None:
     class Watched(OneByOne):
         def settled(self) -> tuple[Any, Any]:
             begun.append(self.waiting.popleft())
+            write_json(begun[-1].out / "diagnosis.json", {})
             return begun[-1], blind_run.Outcome("consistent", 1.0)
 
     run_cases(found, Journal(tmp_path / "out", commitment), Watched, 1, lambda *_: None)
@@ -279,9 +313,10 @@ def test_killed_and_started_again_it_goes_on(quick: Path) -> None:
 @pytest.mark.timeout(3600)
 def test_made_diagnosed_and_scored(tmp_path: Path) -> None:
     """A set of the generator's, from the first command to the last."""
-    counts = ("--robot", "servo_bench=2", "--nulls", "servo_bench=1", "--seed", "try")
+    counts = ("--robot", "servo_bench=2", "--nulls", "servo_bench=1", "--seed", "once and for all")
     made = pup_process(
-        *("blind", "make", *counts, "--out", tmp_path / "set", "--key", tmp_path / "key.json")
+        *("blind", "make", *counts, "--out", tmp_path / "set", "--key", tmp_path / "key.json"),
+        *("--cores", 2),
     )
     assert made.code == 0, made.err
     job = Job(*command(tmp_path), "--cores", 2, out=tmp_path / "out")

@@ -128,7 +128,7 @@ def reveal(folder: Path, cases: Any) -> Path:
     """Write a set under `set`, its `key.json` and the verdicts under `diagnoses`."""
     (folder / "set").mkdir()
     write_key(folder / "key.json", {"schema": 1, "salt": "ab", "cases": [c for c, _ in cases]})
-    commit(folder / "set", folder / "key.json", {"darwin_op2": len(cases)})
+    commit(folder / "set", folder / "key.json")
     for truth, told in cases:
         if told is not None:
             write_json(folder / "diagnoses" / f"case_{truth['id']}" / "diagnosis.json", told)
@@ -309,7 +309,7 @@ def test_times_in_repeats_do_not_count(tmp_path: Path) -> None:
     runs = [replace(run, id="r01"), replace(run, id="r02", repeat_of="r01")]
     assert scored(folder)["all"]["regime_f1"]["mean"] == pytest.approx(2 / 3)
     write_recordings(runs, folder / "set" / "case_a" / "recordings")
-    commit(folder / "set", folder / "key.json", {"darwin_op2": 1})
+    commit(folder / "set", folder / "key.json")
     assert scored(folder)["all"]["regime_f1"]["mean"] == 1.0
 
 
@@ -444,7 +444,7 @@ def test_oracle_ratio_asks_for_a_replay_of_the_test_motions(revealed: Path, leg_
     tests.mkdir(parents=True)
     for file in leg_recordings.glob("*.parquet"):
         (tests / file.name).write_bytes(file.read_bytes())
-    commit(revealed / "set", revealed / "key.json", {"darwin_op2": len(CASES)})
+    commit(revealed / "set", revealed / "key.json")
     asked = []
 
     def replay(diagnosed: Path, recordings: Any) -> Replayed:
@@ -472,7 +472,7 @@ def test_the_key_says_what_a_refit_leaves_of_test_motions(tmp_path: Path) -> Non
         write_recordings(poor(1), folder / "set" / f"case_{name}" / "test")
         if name not in "bd":
             (folder / "diagnoses" / f"case_{name}" / "corrected").mkdir()
-    commit(folder / "set", folder / "key.json", {"darwin_op2": 5})
+    commit(folder / "set", folder / "key.json")
     asked = []
 
     def replay(diagnosed: Path, recordings: Any) -> Replayed:

@@ -114,7 +114,7 @@ def _(place: Place) -> Made:
 
 def make(place: Place, *options: object, key: Path | None = None) -> list[object]:
     key = key or place.here / "key.json"
-    return ["blind", "make", "--seed", "s", "--key", key, "--out", place.out, *options]
+    return ["blind", "make", "--seed", 16 * "s", "--key", key, "--out", place.out, *options]
 
 
 ONE = ("--nulls", "servo_bench=1")

@@ -216,6 +216,7 @@ def _truth(draft: Draft, id: str, stratum: str, verdicts: Sequence[str]) -> dict
         "engine": draft.world.engine.document(),
         "noise": {**vars(draft.noise), "sigma": draft.noise.sigma},
         "answer": {"verdicts": list(verdicts), "set": list(draft.answers)},
+        "recordings": sorted(plan.id for plan in draft.plans if not plan.test),
         "tests": sorted(plan.id for plan in draft.plans if plan.test),
     }
 

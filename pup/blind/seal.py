@@ -2,7 +2,9 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,12 @@ ALGORITHM = "SHA-256 of the salt's hexadecimal digits followed by the bytes of t
 
 
 def write_key(path: Path, key: Mapping[str, Any]) -> None:
-    """Write the key; its bytes depend on its content alone."""
-    write_atomic(path, json.dumps(key, indent=1, sort_keys=True, allow_nan=False) + "\n")
+    """Write the key, or a part of it, for its owner alone; its bytes depend on its content."""
+    mask = os.umask(0o077)
+    try:
+        write_atomic(path, json.dumps(key, indent=1, sort_keys=True, allow_nan=False) + "\n")
+    finally:
+        os.umask(mask)
 
 
 def read_key(path: Path) -> dict[str, Any]:
@@ -44,20 +50,19 @@ def digest_of_set(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def commit(folder: Path, key: Path, counts: Mapping[str, int]) -> dict[str, Any]:
-    """Write a set's commitment.
+def commit(folder: Path, key: Path) -> dict[str, Any]:
+    """Write a set's commitment; how many of its cases are nulls stays concealed.
 
     Args:
       folder: the set.
       key: its key, already written.
-      counts: cases per robot; how many of them are nulls stays concealed.
     """
     commitment = {
         "schema": 1,
         "algorithm": ALGORITHM,
         "key_sha256": digest_of_key(key),
         "recordings_sha256": digest_of_set(folder),
-        "cases": dict(counts),
+        "cases": _counts(read_key(key)["cases"]),
         "engine_git_sha": None,
     }
     write_json(folder / COMMITMENT, commitment)
@@ -86,12 +91,34 @@ def verify(folder: Path, key: Path) -> dict[str, Any]:
       The key.
 
     Raises:
-      InputError: the folder is no set, or the key or a recording is not the one committed to.
+      InputError: the folder is no set, or the key, a recording or the cases are not those committed
+        to.
     """
     if _commitment(folder).get("key_sha256") != digest_of_key(key):
         raise InputError(f"{key}: not the key that {folder / COMMITMENT} commits to")
-    read_set(folder)
-    return read_key(key)
+    told, known = read_set(folder).get("cases"), read_key(key)
+    if told != _counts(known["cases"]):
+        raise InputError(f"{folder / COMMITMENT}: its cases are not those of the key {key}")
+    if "generator" in known:  # keys of earlier sets have no such word, and were not checked
+        check_cases(folder, known["cases"])
+    return known
+
+
+def check_cases(folder: Path, truths: Sequence[Mapping[str, Any]]) -> None:
+    """Check that a set has the cases of its key, and no others.
+
+    Raises:
+      InputError: it has not.
+    """
+    wanted = {f"case_{truth['id']}" for truth in truths}
+    apart = wanted ^ {case.name for case in folder.glob("case_*")}
+    if apart:
+        raise InputError(f"{folder}: {', '.join(sorted(apart))} in it or in its key, not in both")
+
+
+def _counts(truths: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Cases per robot."""
+    return dict(sorted(Counter(truth["robot"] for truth in truths).items()))
 
 
 def _commitment(folder: Path) -> dict[str, Any]:

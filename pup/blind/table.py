@@ -55,6 +55,7 @@ def markdown(scores: Mapping[str, Any]) -> str:
         f"Commitment {scores['commitment']['key_sha256']}, to engine "
         f"{scores['commitment']['engine_git_sha'] or 'not named'}; "
         f"diagnosed by {_engine(scores.get('engine'))}.",
+        *(f"\nWarning: {doubt}" for doubt in scores.get("doubts", ())),
         "",
         "| omissions | value | 95 % |",
         "|---|---|---|",
