@@ -242,6 +242,15 @@ def test_an_integral_that_has_held_a_load_starts_with_it() -> None:
     assert sent[1] == pytest.approx(plain[1], abs=1e-3)
 
 
+def test_an_integral_does_not_wind_up_while_the_torque_is_off() -> None:
+    """A joint that hangs down is sent off in the same way at once and after a second without."""
+    gain = {f"integral_action/gain{AT}": 15.0}
+    (at_once,) = bench(held(0.5, 1.0, 0.0), gain)
+    off = {"torque_enabled": (np.arange(100) >= 50).astype(float)}
+    (later,) = bench(held(0.5, 2.0, 0.0, extras=off), gain)
+    assert np.abs(later[50:] - at_once).max() < 1e-3
+
+
 def test_a_dead_band_adds_its_width_to_every_error() -> None:
     for angle in (0.5, -0.5):
         (read,) = bench(held(angle), {f"dead_band/width{AT}": 0.01})

@@ -13,6 +13,8 @@ from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import NETWORK_NAMES, robot_space
 from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription, built_in_robots
+from pup.robot_parts import TermSpec
+from pup.robot_writer import write_corrected
 from pup.sysid.excitation import script
 from pup.sysid.loss import ReplayLoss
 from pup.sysid.virtual import (
@@ -63,6 +65,26 @@ def test_recordings_replay_to_themselves_under_the_truth(
     found = replayed(op2, recordings, "nn_pd", **truth)
     assert (found < [WITHIN[r.support] for r in recordings]).all(), found
     assert (replayed(op2, recordings, "nn_pd") > 2 * found).all()
+
+
+@pytest.mark.parametrize(
+    ("effect", "values"),
+    [
+        ("clock_skew", {"share": 0.02}),
+        ("thermal_drift", {"rate": 0.05}),
+        ("thermal_drift", {"rate": 0.5, "load": 1.0}),
+    ],
+)
+def test_what_grows_with_time_begins_with_the_recording(
+    effect: str, values: dict[str, float], tmp_path: Path
+) -> None:
+    """Not with the time to settle before it, of which a replay knows nothing."""
+    leg = RobotDescription.load("darwin_leg")
+    robot = write_corrected(leg, tmp_path, {}, [TermSpec(effect, "robot", "", values)])
+    rng = np.random.default_rng(0)
+    seen = record_virtual(robot, script(robot, ["step:0.6"], rng), "pd", {}, rng, QUIET)
+    assert replayed(robot, seen, "pd").max() < 2e-4
+    assert replayed(leg, seen, "pd").max() > 2e-3
 
 
 def test_torso_and_feet_replay_to_themselves_too(

@@ -79,6 +79,7 @@ class MujocoSimulator:
       recordings: what is replayed, each for exactly this robot.
       actuator: the torque law, `pd` or `nn_pd`.
       threads: batches that run at once, one core each.
+      lead: time of each recording before clocks drift and motors warm, s.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class MujocoSimulator:
         recordings: Sequence[Recording],
         actuator: str = "nn_pd",
         threads: int = 1,
+        lead: float = 0.0,
     ) -> None:
         if actuator not in LAWS:
             raise InputError(f"actuator {actuator!r} is unknown; known: {', '.join(LAWS)}")
@@ -96,6 +98,7 @@ class MujocoSimulator:
         self.recordings = tuple(recordings)
         self.law = LAWS[actuator]
         self.threads = threads
+        self.lead = lead
         self.ticks = tick_slices(self.recordings)
         supports = sorted({r.support for r in self.recordings})
         self.groups = tuple(self._group(support) for support in supports)
@@ -130,7 +133,7 @@ class MujocoSimulator:
         return out
 
     def _run(self, group: Group, candidates: Candidates, push: Push | None) -> "Run":
-        return Run(self.robot, group, candidates, self.law, push)
+        return Run(self.robot, group, candidates, self.law, push, self.lead)
 
     def _parts(self, group: Group, candidates: int) -> list[slice]:
         """The candidates in parts of one batch each, equally many parts for every thread."""
@@ -202,6 +205,7 @@ class Run:
         candidates: Candidates,
         law: Callable[[RobotDescription, Candidates], TorqueLaw],
         push: Push | None = None,
+        lead: float = 0.0,
     ) -> None:
         self.robot = robot
         self.group = group
@@ -215,7 +219,7 @@ class Run:
         writer.done()
         self.terms = outfit.terms
         delay = each["command_delay"] if "command_delay" in candidates else None
-        self.servos = Servos(outfit, group.commands, group.power, delay, self.candidates)
+        self.servos = Servos(outfit, group.commands, group.power, delay, self.candidates, lead)
         self.push = None if push is None else Pushing(push, group.model, robot.timestep)
         self.ids = np.arange(nsim, dtype=np.int32)
         self.broken = np.zeros(nsim, dtype=bool)

@@ -13,7 +13,7 @@ from pup.physics import kernels
 from pup.physics.commands import HeldCommands, Target
 from pup.physics.limited import LimitedLaw
 from pup.physics.outfit import Outfit
-from pup.physics.terms.base import Drive, Flow, Term
+from pup.physics.terms.base import Drive, Flow, Outcome, Term
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,7 @@ class Servos:
       power: share of each sub-step with the torque on, shape (n_steps, n_recordings); None for 1.
       delay: of the commands, shape (n_simulations,), s; None where there is none.
       candidates: how many there are.
+      lead: time that each recording begins with before the time that terms go by, s.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class Servos:
         power: Array | None,
         delay: Array | None,
         candidates: int,
+        lead: float = 0.0,
     ) -> None:
         self.law, self.scene, self.viscous = outfit.law, outfit.scene, outfit.viscous
         self.limited = LimitedLaw(self.law, self.scene.inertia, self.viscous, self.scene.timestep)
@@ -45,6 +47,7 @@ class Servos:
         self.power = None if power is None or (power == 1).all() else power
         self.delay = None if delay is None else delay[:, None]
         self.candidates = candidates
+        self.lead = lead
 
         def of(hook: str) -> list[Term]:
             return [term for term in outfit.terms if term.answers(hook)]
@@ -87,7 +90,7 @@ class Servos:
         Returns:
           The applied torque (N m) and the viscous coefficient (N m s/rad), both of that shape.
         """
-        time: float | Array = step * self.scene.timestep
+        time: float | Array = step * self.scene.timestep - self.lead
         running = len(link[0]) // self.candidates
         target = self._target(step, running, time)
         error, torque, damping, own = self._answer(target.now, sensed)
@@ -103,8 +106,10 @@ class Servos:
             damping *= on
             own = None if own is None else own * on
         self.limited.keep(sensed[1], torque, damping)
-        for term in self.settling:
-            term.settle(error, torque - damping * sensed[1])
+        if self.settling:
+            outcome = Outcome(time, error, torque - damping * sensed[1], 1.0 if on is None else on)
+            for term in self.settling:
+                term.settle(outcome)
         brake, viscous = self.limited.split(torque, damping, sensed[1], still)
         if self.flowing:
             now = sensed[1]

@@ -146,7 +146,7 @@ def record_virtual(
     plans = [
         _plan(robot, motion, turn, noise, rng) for motion in motions for turn in range(repeats)
     ]
-    simulator = MujocoSimulator(robot, plans, actuator)
+    simulator = MujocoSimulator(robot, plans, actuator, lead=SETTLING)
     seen = simulator.replay(space.at(parameters).candidates())
     for plan, diverged in zip(plans, seen.diverged[0], strict=True):
         if diverged:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from pup.physics.implicit import implicit_share
 from pup.physics.terms import kernels
-from pup.physics.terms.base import Drive, Flow, Quantity, Term, begin
+from pup.physics.terms.base import Drive, Flow, Outcome, Quantity, Term, begin
 
 Array = NDArray[np.float64]
 
@@ -109,10 +109,10 @@ class VoltageSag(Term):
         drive.upper *= left
         drive.lower *= left
 
-    def settle(self, error: Array, torque: Array) -> None:
+    def settle(self, outcome: Outcome) -> None:
         """See Term."""
-        n = len(torque)
-        load = self.values["drop"][:n] * np.abs(torque).sum(axis=1, keepdims=True)
+        n = len(outcome.torque)
+        load = self.values["drop"][:n] * np.abs(outcome.torque).sum(axis=1, keepdims=True)
         goal = 1 / (1 + load)  # the supply's own resistance also limits what it gives
         self._left[:n] = goal + self._kept[:n] * (self._left[:n] - goal)
 
@@ -147,10 +147,12 @@ class ThermalDrift(Term):
         drive.lower *= left
         drive.damping *= 1 - self.values["load"][:n] * (1 - left)
 
-    def settle(self, error: Array, torque: Array) -> None:
-        """See Term."""
-        n, load = len(torque), self.values["load"][: len(torque)]
-        gained = 1 - load + load * np.abs(torque) / self.scene.limit[:n]
+    def settle(self, outcome: Outcome) -> None:
+        """See Term: nothing warms before the recording begins."""
+        n = len(outcome.torque)
+        load = self.values["load"][:n]
+        gained = 1 - load + load * np.abs(outcome.torque) / self.scene.limit[:n]
+        gained *= outcome.time >= 0
         lost = self._warmth[:n] / self.values["time"][:n]
         self._warmth[:n] += self.scene.timestep * (gained - lost)
 
@@ -208,9 +210,10 @@ class IntegralAction(Term):
         n = len(drive.torque)
         drive.torque += self.values["gain"][:n] * self._after(self.scene.timestep / 2, drive.error)
 
-    def settle(self, error: Array, torque: Array) -> None:
-        """See Term."""
-        self._sum[: len(error)] = self._after(self.scene.timestep, error)
+    def settle(self, outcome: Outcome) -> None:
+        """See Term: a servo whose torque is off forgets its integral."""
+        after = self._after(self.scene.timestep, outcome.error)
+        self._sum[: len(after)] = after * outcome.on
 
     def _after(self, time: float | Array, error: Array) -> Array:
         """What an error makes of the integral in some time, rad s."""

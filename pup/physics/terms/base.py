@@ -122,7 +122,8 @@ class Flow:
     What it moves is the motor at first, and the link from where motors of their own engage it.
 
     Attributes:
-      time: since the recording's start, s; or since each simulation's own, shape (n_active, 1).
+      time: since the recording's start, s, negative while a robot settles before it; or since each
+        simulation's own, shape (n_active, 1).
       position: of the link, rad.
       link: its velocity, rad/s.
       velocity: of what the torque moves, rad/s.
@@ -151,6 +152,23 @@ class Flow:
     def carried(self) -> Array:
         """The torque that is applied, N m: damping is, by the velocity at the end."""
         return self.torque - self.damping * self.coming
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a sub-step has come to at the servos.
+
+    Attributes:
+      time: see Flow.
+      error: the controller's, (n_active, n_joints), rad.
+      torque: of the servo, same shape, N m.
+      on: share of the sub-step with the torque on, broadcastable to them.
+    """
+
+    time: float | Array
+    error: Array
+    torque: Array
+    on: float | Array
 
 
 class Term:
@@ -256,8 +274,8 @@ class Term:
         """Change the servo's torque and its limits, in place; keeps no state."""
         raise NotImplementedError
 
-    def settle(self, error: Array, torque: Array) -> None:
-        """Take note of a sub-step's error and servo torque."""
+    def settle(self, outcome: Outcome) -> None:
+        """Take note of what a sub-step has come to."""
         raise NotImplementedError
 
     def flow(self, flow: Flow) -> None:

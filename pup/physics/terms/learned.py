@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.terms.base import Flow, Quantity, Term, begin
+from pup.physics.terms.base import Flow, Outcome, Quantity, Term, begin
 
 Array = NDArray[np.float64]
 
@@ -181,9 +181,10 @@ class LearnedLaw(Term):
         self._target[:n] = now
         return now, before
 
-    def settle(self, error: Array, torque: Array) -> None:
+    def settle(self, outcome: Outcome) -> None:
         """See Term."""
-        self._error[: len(error)], self._torque[: len(error)] = error, torque
+        n = len(outcome.error)
+        self._error[:n], self._torque[:n] = outcome.error, outcome.torque
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
