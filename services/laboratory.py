@@ -147,7 +147,11 @@ class Laboratory(AbstractContextManager["Laboratory"]):
             self._attend()
 
     def _attend(self) -> None:
-        if self._agent("health")["state"] in ("disabled", "stopped", "fault"):
+        state = self._agent("health")["state"]
+        if state == "fault":  # it may lie on an arm, and a servo that has shut down stays so
+            for do in ("supply", "reset"):
+                say(self._passing / "side", {"cmd": do})
+        if state in ("disabled", "stopped", "fault"):
             self._agent("enable")
 
     def _open(self) -> None:

@@ -1,10 +1,13 @@
 """Walks without a bus are those through it."""
 
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from agents import wait
 
+from hardware_agent.control import say
 from hardware_agent.virtual.fleet import Fleet
 from hardware_agent.virtual.walks import walk
 from pup.policy.bundle import NumpyPolicy
@@ -52,3 +55,22 @@ def _lame(policy: NumpyPolicy) -> NumpyPolicy:
     bias[-1, policy.card.joints.index("l_hip_pitch")] += 1000.0
     policy.actor[-1] = (weight, bias.reshape(-1))
     return policy
+
+
+def test_a_robot_whose_servo_has_shut_down_is_mended_by_hand(tmp_path: Path) -> None:
+    """Its power is switched and it is lifted, as an operator would; by itself it stays so."""
+    with Laboratory(tmp_path, DARWIN, POLICY, SEED) as laboratory:
+        side, agent = (laboratory._passing / name for name in ("side", "agent.sock"))
+
+        def state() -> str:
+            return str(say(agent, {"do": "health"})["state"])
+
+        say(side, {"cmd": "fault", "kind": "hot_motor", "id": DARWIN.joints[0].servo_id})
+        wait(lambda: state() == "fault", 30)
+        say(side, {"cmd": "clear"})
+        say(agent, {"do": "enable"})
+        wait(lambda: state() == "fault", 30)
+        laboratory.tend()
+        for _ in range(20):
+            assert state() == "enabled"
+            time.sleep(0.05)

@@ -90,6 +90,7 @@ class Server(AbstractContextManager["Server"]):
             "fault": self._fault,
             "clear": self._clear,
             "battery": self._battery,
+            "supply": self._supply,
             "button": self._button,
         }
 
@@ -272,6 +273,12 @@ class Server(AbstractContextManager["Server"]):
 
     def _battery(self, told: Mapping[str, Any]) -> None:
         self.robot.battery()
+
+    def _supply(self, told: Mapping[str, Any]) -> None:
+        """The main switch, off and on."""
+        for servo in self.robot.servos:
+            servo.supply(False)
+            servo.supply(True)
 
     def _button(self, told: Mapping[str, Any]) -> None:
         pressed = told.get("pressed")
