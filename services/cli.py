@@ -10,6 +10,7 @@ from pup.errors import InputError
 from pup.files import MISTAKES
 from services import stopping
 from services.arguments import parser
+from services.failures import FailedError
 from services.verbs import VERBS
 
 DONE, FAILED, REFUSED, STOPPED = 0, 1, 2, 130
@@ -31,8 +32,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"pup {options.name}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return REFUSED
-    except KeyboardInterrupt:
-        print(f"pup {options.name}: stopped; the same command resumes", file=sys.stderr)
+    except FailedError as error:
+        print(f"pup {options.name}: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt as error:
+        told = str(error) or "stopped; the same command resumes"
+        print(f"pup {options.name}: {told}", file=sys.stderr)
         return STOPPED
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""

@@ -11,6 +11,10 @@ SHOWN = 5
 """Failed jobs that a message names."""
 
 
+class FailedError(RuntimeError):
+    """What was asked for did not come to be, for no fault in the asking: told in one line."""
+
+
 def caught(folder: Path, error: Exception) -> str:
     """Write down what a job raised, and tell it in a line."""
     message = f"{type(error).__name__}: {' '.join(str(error).split())}"

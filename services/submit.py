@@ -12,6 +12,7 @@ import httpx
 
 from pup.errors import InputError
 from pup.files import sha256
+from services.failures import FailedError
 from services.job_arguments import command
 from services.transfer import Gateway, token_of
 
@@ -24,7 +25,9 @@ def submit(options: argparse.Namespace) -> dict[str, Any]:
     """Have a verb run; with `wait` until it ends, with its log on standard error.
 
     Raises:
-      InputError: the verb or the service refuses it, or it ended without a result.
+      InputError: the verb or the service refuses it, before or while it ran.
+      FailedError: it ended without a result otherwise.
+      KeyboardInterrupt: the user waits no longer; the job goes on.
     """
     arguments = [a for a in options.arguments if a != "--"]
     command(options.verb, arguments, Path("out"))
@@ -36,9 +39,13 @@ def submit(options: argparse.Namespace) -> dict[str, Any]:
     job = gateway.post("/v1/jobs", asked, options.key)
     if not options.wait:
         return {"job": job, "page": f"{options.url}/jobs/{job['id']}"}
-    print(f"{options.url}/jobs/{job['id']}", file=sys.stderr, flush=True)
-    for told in _log(gateway, job["id"], follow=True):
-        print(told, end="", file=sys.stderr, flush=True)
+    try:
+        print(f"{options.url}/jobs/{job['id']}", file=sys.stderr, flush=True)
+        for told in _log(gateway, job["id"], follow=True):
+            print(told, end="", file=sys.stderr, flush=True)
+    except KeyboardInterrupt as stop:
+        name = job["id"]
+        raise KeyboardInterrupt(f"{name} goes on; pup jobs logs {name} --follow") from stop
     return {"job": _ended(gateway, job["id"])}
 
 
@@ -138,9 +145,12 @@ def _log(gateway: Gateway, job: str, follow: bool) -> Iterator[str]:
 
 def _ended(gateway: Gateway, job: str) -> Any:
     told = gateway.get(f"/v1/jobs/{job}")
-    if told["state"] != "succeeded":
-        raise InputError(f"{job} has {told['state']}: {told['reason']}")
-    return told
+    if told["state"] == "succeeded":
+        return told
+    line = f"{job} has {told['state']}: {told['reason']}"
+    if told["state"] == "failed" and told["failures"] <= told["retries"]:
+        raise InputError(line)  # bad input ends a job at once, all else when no retry is left
+    raise FailedError(line)
 
 
 def _gateway(options: argparse.Namespace) -> Gateway:

@@ -2,11 +2,14 @@
 
 import os
 import signal
+import socket
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import ray
+from commandline import TINY, pup_process
 
 from pup.errors import InputError
 from workers.cluster import connected, staying
@@ -50,3 +53,18 @@ def test_a_machine_too_busy_for_ray_is_told_in_a_line(monkeypatch: pytest.Monkey
     monkeypatch.setattr(ray, "init", start)
     with pytest.raises(InputError, match="busy"), connected(cores=1):
         pass
+
+
+def test_a_cluster_without_a_token_for_it_is_told_in_a_line(
+    bench_recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("HOME", str(tmp_path))  # where Ray would look for one
+    for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        given = ("presysid", bench_recordings, "--robot", "servo_bench", "--out", tmp_path / "out")
+        done = pup_process(*given, *TINY[1:], "--address", address)
+    assert done.code == 2
+    assert f"{address}: no token" in done.err and len(done.err.splitlines()) == 1

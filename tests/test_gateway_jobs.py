@@ -1,7 +1,11 @@
 """The REST interface of jobs, on a real gateway whose Ray cluster is away."""
 
+import asyncio
 import json
+import signal
 import socket
+import subprocess
+import sys
 
 import gateways
 import httpx
@@ -10,10 +14,15 @@ import stored_jobs
 from commandline import files, pup
 from test_gateway import is_problem
 
+from services.gateway.dispatcher import _named
+from services.gateway.jobs import JobState
+from services.gateway.store import Store
+
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
 
 FIT = {"verb": "presysid", "arguments": ["recordings", "--robot", "servo_bench"]}
+FIT_COMMAND = (FIT["verb"], *FIT["arguments"])
 READS = ("/v1/jobs", "/v1/jobs/x", "/v1/jobs/x/logs", "/v1/jobs/x/artifacts", "/v1/jobs/-/events")
 READS += ("/v1/jobs/x/artifacts/a", "/v1/jobs/x/events")
 WRITES = ("/v1/jobs", "/v1/jobs/x:cancel", "/v1/jobs/x:retry")
@@ -250,6 +259,42 @@ def test_the_command_line_submits_and_asks(service, where, tmp_path):
     assert set(files(out)) == {"bounds.json", "checkpoints/fit 1%.npz"}
     one = pup("jobs", "fetch", "job-done", "bounds.json", "--out", tmp_path / "one", *where)
     assert one.code == 0 and set(files(tmp_path / "one")) == {"bounds.json"}
+
+
+def test_who_waits_no_longer_is_told_how_to_wait_again(service, where):
+    given = ("--wait", "--key", "waited-for", *FIT_COMMAND)
+    command = [sys.executable, "-m", "services.cli", "submit", *where, *given]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    job = process.stderr.readline().strip().rpartition("/")[2]
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told == f"pup submit: {job} goes on; pup jobs logs {job} --follow\n"
+    with service.client() as http:
+        assert http.post(f"/v1/jobs/{job}:cancel").json()["state"] == "cancelled"
+
+
+def test_the_exit_code_tells_bad_input_from_other_ends(tmp_path, monkeypatch):
+    ends = {
+        "refused": (2, JobState.FAILED, {}),
+        "failed": (1, JobState.FAILED, {"failures": 4}),
+        "lost": (1, JobState.LOST, {"failures": 4}),
+        "cancelled": (1, JobState.CANCELLED, {"cancelled_by": "operator"}),
+    }
+    stored_jobs.keep(tmp_path / "data", tmp_path / "shared")
+    store = Store(f"sqlite:///{tmp_path / 'data' / 'gateway.db'}")
+    for key, (_, state, more) in ends.items():
+        job = stored_jobs.of("x", state, f"it was {key}", **more)
+        asyncio.run(store.write_job(_named(job, key)))
+    store.close()
+    away = f"http://127.0.0.1:{gateways.free_port()}"
+    with gateways.running(tmp_path / "data", RAY=away, SHARED=str(tmp_path / "shared")) as made:
+        monkeypatch.setenv("PUP_TOKEN", made.tokens["operator"])
+        for key, (code, state, _) in ends.items():
+            given = ("--wait", "--key", key, "presysid", *stored_jobs.FIT)
+            done = pup("submit", "--url", made.url, *given)
+            assert done.code == code, done.err
+            assert f"has {state}: it was {key}" in done.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

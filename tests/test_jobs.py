@@ -162,6 +162,19 @@ def test_attempts_are_made_until_there_are_no_more_retries():
     )
 
 
+def test_what_was_lost_after_long_work_is_tried_again_and_again():
+    job, lost, now = NEW, Seen(Status.UNKNOWN), 10.0
+    for lasted in (700.0, 700.0, 700.0, 30.0):
+        job = reconciled(job, Seen(Status.RUNNING), None, True, now)
+        job = reconciled(job, lost, None, True, now + lasted)
+        assert (job.state, job.failures) == (JobState.QUEUED, 1 + (lasted < 600))
+        now = job.due
+        job = job.attempted(now)
+    job = reconciled(job, Seen(Status.RUNNING), None, True, now)
+    ended = reconciled(job, Seen(Status.FAILED, "killed", 137), None, True, now + 700)
+    assert ended.state is JobState.FAILED  # by its own process, whose memory was too small, say
+
+
 def test_bad_input_is_not_tried_again_and_waiting_costs_no_retry():
     failed = reconciled(NEW, Seen(Status.FAILED, "x\nno such robot", 2), None, True, 2.0)
     assert (failed.state, failed.reason) == (JobState.FAILED, "no such robot")

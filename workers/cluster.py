@@ -22,6 +22,7 @@ import ray
 from ray._private import ray_constants
 from ray._private import utils as ray_utils
 from ray._private import worker as ray_worker
+from ray.exceptions import AuthenticationError
 
 from pup.errors import InputError
 from workers import reaper
@@ -52,7 +53,7 @@ def connected(address: str | None = None, cores: int | None = None) -> Iterator[
       cores: of the embedded one; None takes those it finds.
 
     Raises:
-      InputError: there is no cluster at that address.
+      InputError: there is no cluster at that address, or it has another token.
     """
     if _staying is None:
         with _connected(address, cores):
@@ -101,10 +102,15 @@ def _joined(address: str) -> Iterator[None]:
         try:
             with _own_signals():
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except AuthenticationError as error:
+            raise InputError(
+                f"--address {address}: no token that the Ray cluster takes; set RAY_AUTH_TOKEN or "
+                "RAY_AUTH_TOKEN_PATH to that of the cluster"
+            ) from error
         except (ConnectionError, ValueError, RuntimeError) as error:
             told = " ".join(str(error).split())[:200]
             raise InputError(
-                f"--address {address}: no Ray cluster answers there ({told})"
+                f"--address {address}: no Ray cluster answers there, or not to this token ({told})"
             ) from error
         yield
     finally:

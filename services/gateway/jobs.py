@@ -19,6 +19,8 @@ DONE, BAD_INPUT = 0, 2
 ELSEWHERE = "stopped on the Ray cluster, not by this service"
 BACKOFF, LONGEST = 5.0, 300.0
 """Before the second attempt, doubled before each later one up to the longest, s."""
+PROGRESS = 600.0
+"""An attempt that was lost after running longer did something: those before it count no more, s."""
 
 
 class JobState(StrEnum):
@@ -108,7 +110,7 @@ class Job:
       state: where it is.
       reason: why it is there, in words.
       cancelled_by: who called it off, or empty.
-      failures: attempts that count against `retries`.
+      failures: attempts that count against `retries`: those since the last long one that was lost.
       attempts: oldest first.
     """
 
@@ -234,7 +236,9 @@ def _fallen(job: Job, end: JobState, why: str, now: float) -> Job:
     """After an attempt without a result: the next one, or the end."""
     if job.cancelled_by:
         return _end(job, JobState.CANCELLED, job.reason, now, why)
-    failures = job.failures + 1
+    began = job.last.started
+    lasted = end is JobState.LOST and began is not None and now - began > PROGRESS
+    failures = 1 if lasted else job.failures + 1
     if failures > job.retries:
         return replace(_end(job, end, why, now, why), failures=failures)
     reason = f"attempt {job.last.number}: {why}; it is tried again"
