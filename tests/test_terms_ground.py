@@ -1,6 +1,8 @@
 """Effects of the ground and of the IMU, on a standing robot."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from test_simulator import recording
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.simulator import Trajectories
 from pup.recording import Recording
+from pup.robot import RobotDescription
 
 SQUAT = np.array(OP2.poses["half_squat"])
 STIFF = {f"kp/{group}": 40.0 for group in OP2.groups}
@@ -91,6 +94,41 @@ def test_a_mat_gives_way_and_a_lively_floor_throws_back() -> None:
     landed = int(np.argmin(feet[0, :40]))
     thrown = feet[:, landed:].max(axis=1) - feet[:, -1]
     assert thrown[1] > thrown[0] + 1e-3
+
+
+def firm(solref: str, folder: Path) -> RobotDescription:
+    """The robot on a floor of other contact parameters."""
+    shutil.copytree(OP2.folder, folder, ignore=shutil.ignore_patterns("recordings", "policies"))
+    told = (folder / "model.xml").read_text()
+    floor = '<geom name="floor" '
+    assert told.count(floor) == 1
+    (folder / "model.xml").write_text(told.replace(floor, f'{floor}solref="{solref}" '))
+    return RobotDescription.load(str(folder))
+
+
+def test_stiffness_and_damping_of_a_floor_are_changed_like_its_times(tmp_path: Path) -> None:
+    """MuJoCo takes either: damping 2 / time, stiffness 1 / (time ratio)^2, as negative numbers."""
+    times = firm("0.03 0.8", tmp_path / "times")
+    direct = firm(f"{-1 / 0.024**2!r} {-2 / 0.03!r}", tmp_path / "direct")
+    rows = [
+        {},
+        {"ground_compliance/time@ground": 0.02},
+        {"contact_restitution/share@ground": 0.4},
+        {f"ground_compliance/time@foot:{LEFT}": 0.03, "contact_restitution/share@ground": 0.3},
+    ]
+    one, two = (
+        play(robot, standing(0.6), [STIFF | row for row in rows]).feet for robot in (times, direct)
+    )
+    assert one == pytest.approx(two, abs=1e-9)
+    assert (np.abs(one[1:] - one[0]).max(axis=(1, 2, 3)) > 1e-4).all()
+
+
+def test_a_floor_without_friction_keeps_what_it_has(tmp_path: Path) -> None:
+    """Beside another that a foot has: no change of one is the bits of no term."""
+    run, slick = standing(0.4, (0.0, 0.05)), {"ground_friction": 0.01}
+    other = {f"ground_friction/change@foot:{LEFT}": 0.3}
+    alone, among = (stand(run, *rows).position[0] for rows in ([slick], [slick, slick | other]))
+    np.testing.assert_array_equal(alone, among)
 
 
 def tilts(delay: float, step: float) -> tuple[Array, Array]:

@@ -10,6 +10,14 @@ from pup.physics.writer import FieldWriter
 
 Array = NDArray[np.float64]
 
+LEAST = 0.02
+"""Friction coefficient that a change leaves, of what there was."""
+
+
+def _direct(solref: Array) -> NDArray[np.bool_]:
+    """Whether contact parameters (n, 2) are MuJoCo's stiffness and damping, negative; (n, 1)."""
+    return np.asarray(solref[:, :1] <= 0)
+
 
 class GroundCompliance(Term):
     """A softer floor: contacts take longer to push back."""
@@ -24,7 +32,12 @@ class GroundCompliance(Term):
         """See Term."""
         solref = writer.field("geom_solref")
         for geom, column in self.scene.model.contacts:
-            solref[:, geom, 0] += self.values["time"][:, column]
+            own, time = solref[:, geom], self.values["time"][:, column]
+            # Of stiffness and damping instead, negative, the time constant is two by the damping.
+            slower = 1 / (1 + np.maximum(-own[:, 1], 0.0) * time / 2)
+            direct = own * np.stack([slower**2, slower], axis=1)
+            slow = own + np.stack([time, np.zeros_like(time)], axis=1)
+            solref[:, geom] = np.where(_direct(own), direct, slow)
 
 
 class ContactRestitution(Term):
@@ -41,8 +54,10 @@ class ContactRestitution(Term):
         solref = writer.field("geom_solref")
         left = np.maximum(1 - self.values["share"], 0.02)
         for geom, column in self.scene.model.contacts:
-            # MuJoCo's stiffness goes by the product of the two, its damping by the first.
-            solref[:, geom, 0] /= left[:, column]
+            # MuJoCo's stiffness goes by the product of the two, its damping by the first, unless
+            # they are themselves stiffness and damping.
+            direct = _direct(solref[:, geom])[:, 0]
+            solref[:, geom, 0] /= np.where(direct, 1.0, left[:, column])
             solref[:, geom, 1] *= left[:, column]
 
 
@@ -59,8 +74,9 @@ class GroundFriction(Term):
         """See Term."""
         friction = writer.field("geom_friction")
         for geom, column in self.scene.model.contacts:
-            changed = friction[:, geom, 0] + self.values["change"][:, column]
-            friction[:, geom, 0] = np.maximum(changed, 0.02)
+            own = friction[:, geom, 0]
+            changed = own + self.values["change"][:, column]
+            friction[:, geom, 0] = np.maximum(changed, np.minimum(own, LEAST))
 
 
 class GroundSlope(Term):
