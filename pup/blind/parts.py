@@ -3,9 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from pup.blind.world import Array, Effect, Plan
+from pup.blind.world import Array, Effect, Plan, spanned
 
 
 @dataclass(eq=False)
@@ -77,7 +75,7 @@ class Part:
         self.shape = effect.shape
         self.form = effect.form
         self.stage = stage
-        self.at = (Ellipsis, np.array(joints, dtype=np.int64))
+        self.at = (Ellipsis, spanned(joints))
         self.lanes = (stage.shape[0], stage.shape[1], len(joints))
         self.begin()
 

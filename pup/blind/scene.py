@@ -8,7 +8,7 @@ import numpy as np
 from pup.blind import control, losses, unlisted
 from pup.blind.mechanism import Mechanism
 from pup.blind.parts import Moment, Part, Stage, hooks
-from pup.blind.world import Array, Nominal, Plan, World
+from pup.blind.world import Array, Nominal, Plan, World, spanned
 
 SAGS = 12  # rounds of the search for the pose at rest
 CLEAR = 0.0005  # m above the floor to be put down from
@@ -33,6 +33,7 @@ class Scene:
     ) -> None:
         self.world, self.plans, self.mechanism = world, plans, mechanism
         self.batch = mechanism.batch
+        self.joints, self.dofs = spanned(mechanism.qpos), spanned(mechanism.dofs)
         self.shape = (len(nominals), len(plans), len(world.robot.joints))
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qacc, self.force = self.batch.bind("qacc"), self.batch.bind("qfrc_applied")
@@ -84,7 +85,7 @@ class Scene:
 
     def sensed(self) -> Array:
         """What the encoders see."""
-        position: Array = self.qpos[:, self.mechanism.qpos]
+        position: Array = self.qpos[:, self.joints].copy()
         for joint, second, behind in self.mechanism.series:
             if behind:
                 position[:, joint] += self.qpos[:, second]
@@ -102,14 +103,12 @@ class Scene:
           power: shape (n_plans, 1), 0 to 1.
           sensed: what the encoders see now.
         """
-        dofs = self.mechanism.dofs
+        dofs = self.dofs
         acceleration = self.qacc[:, dofs].reshape(self.shape)
         speed = self.qvel[:, dofs].reshape(self.shape) + self.lead * acceleration
         now = Moment(
             time=time,
-            position=self.qpos[:, self.mechanism.qpos].reshape(self.shape)
-            if self.resist
-            else sensed,
+            position=self.qpos[:, self.joints].reshape(self.shape) if self.resist else sensed,
             speed=speed,
             acceleration=acceleration,
             error=target - sensed,

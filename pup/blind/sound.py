@@ -29,12 +29,13 @@ def check(draft: Draft, reference: Reference, seen: Mapping[str, Seen]) -> None:
     """
     train = [plan for plan in reference.plans if not plan.test]
     plan = max(train, key=lambda p: float(np.linalg.norm(_apart(seen[p.id], reference.seen[p.id]))))
-    nominal = reference.seen[plan.id]
+    world, nominal = draft.world, reference.seen[plan.id]
     for effect in draft.effects:
-        change = _change(draft.world, plan, effect, nominal)
-        if not shrinks(draft.world, plan, effect, nominal, change, draft.noise):
+        alone = draft.full().effects == (effect,)
+        change = _apart(seen[plan.id], nominal) if alone else _change(world, plan, effect, nominal)
+        if not shrinks(world, plan, effect, nominal, change, draft.noise):
             raise InputError(f"{effect.name}: it does not shrink with its size")
-        if not converged(draft.world, plan, effect, change, draft.noise):
+        if not converged(world, plan, effect, change, draft.noise):
             raise InputError(f"{effect.name}: it depends on the time step")
 
 

@@ -4,7 +4,7 @@ SI units and radians throughout.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,6 +21,14 @@ STEP = 0.0005  # s, of the truth
 STEADY = 0.8  # of a step times the rate of servo damping; from 1 on it is unstable
 SETTLING = 0.8  # s at rest before a recording on a fixed base, after the static sag is solved for
 SETTLING_ON_FEET = 1.5  # s
+
+
+def spanned(places: Sequence[int] | Indices) -> slice | Indices:
+    """Places as a slice where they follow one another, which arrays are indexed by faster."""
+    first, count = int(places[0]), len(places)
+    if list(places) == list(range(first, first + count)):
+        return slice(first, first + count)
+    return np.array(places, dtype=np.int64)
 
 
 @dataclass(frozen=True)
