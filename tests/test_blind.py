@@ -11,12 +11,13 @@ import pytest
 from commandline import files, pup, pup_process
 from scipy.integrate import solve_ivp
 
-from pup.blind.cases import NULLS, STRATA, strata
+from pup.blind.cases import strata
 from pup.blind.catalogue import CLASS_OF
 from pup.blind.make import make_set
 from pup.blind.origin import generator
 from pup.blind.seal import COMMITMENT, verify
 from pup.blind.sensors import Noise, measure, see
+from pup.blind.setting import NULLS, STRATA
 from pup.blind.simulate import simulate
 from pup.blind.world import Nominal, Plan, World
 from pup.errors import InputError

@@ -7,12 +7,12 @@ import pytest
 from test_blind_effects import plans, world_of
 
 from pup.blind.absorb import readings
-from pup.blind.cases import NULLS, STRATA
 from pup.blind.catalogue import KINDS, MASKED, available, draw, plausible, unlisted
 from pup.blind.drafts import NUISANCE, draw_case, draw_null
 from pup.blind.kit import Kit
 from pup.blind.make import ROBOTS
 from pup.blind.sensors import Noise
+from pup.blind.setting import NULLS, STRATA, Setting, setting
 from pup.blind.sound import converged, shrinks
 from pup.blind.world import STEP, Effect, Engine, Place, Plan, World, steady
 from pup.errors import InputError
@@ -48,6 +48,11 @@ def telling(effect: Effect) -> Effect:
         return replace(effect, size=0.3 * effect.shape["side"])
     shape = {"friction_step": {"onset": 0.3}, "stick_events": {"every": 0.2}}.get(effect.form)
     return replace(effect, shape=shape) if shape else effect
+
+
+def drawn_for(stratum: str, ground: bool, seed: int) -> tuple[np.random.Generator, Setting]:
+    rng = np.random.default_rng(seed)
+    return rng, setting(stratum, ground, rng)
 
 
 def typical(name: str, world: World) -> Effect:
@@ -137,7 +142,7 @@ def test_no_draw_is_of_a_size_that_no_robot_has(
         rng = np.random.default_rng(seed)
         for stratum in ("single", "below_noise", "weak", "masked", "pair", "unlisted"):
             try:
-                draft = draw_case(description, stratum, False, rng)
+                draft = draw_case(description, stratum, False, rng, Setting())
             except InputError:  # a pair of one class, drawn anew by the caller
                 continue
             assert all(plausible(effect, kit) for effect in draft.effects)
@@ -163,7 +168,7 @@ def test_every_kind_of_case_can_be_drawn(
         drawn = 0
         for seed in range(SEEDS):
             try:
-                draft = draw_case(robot, stratum, ground, np.random.default_rng(seed))
+                draft = draw_case(robot, stratum, ground, *drawn_for(stratum, ground, seed))
             except InputError:  # drawn anew by the caller
                 continue
             drawn += 1
@@ -173,8 +178,56 @@ def test_every_kind_of_case_can_be_drawn(
         assert drawn > SEEDS / 2, stratum
     for kind in NULLS:
         for seed in range(SEEDS):
-            null = draw_null(robot, kind, ground, np.random.default_rng(seed))
+            null = draw_null(robot, kind, ground, *drawn_for(f"null:{kind}", ground, seed))
             assert null.stratum == f"null:{kind}" and not null.effects
+
+
+CHANCE = 4.0
+"""Standard deviations by which a share may be off."""
+
+
+@pytest.mark.parametrize(("name", "ground"), [("servo_bench", False), ("darwin_op2", True)])
+def test_what_is_recorded_tells_nothing_of_the_stratum(
+    name: str, ground: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Programmes and setups as they are played, against those of all cases together."""
+    robot = RobotDescription.load(name)
+    played: list[Setting] = []
+
+    def noted(robot: RobotDescription, ground: bool, given: Setting, rng: object) -> tuple[()]:
+        played.append(given)
+        return ()
+
+    monkeypatch.setattr("pup.blind.drafts.programme", noted)
+    monkeypatch.setattr("pup.blind.drafts._stopped", lambda draft, effect: effect)
+    seen: dict[str, list[Setting]] = {}
+    for stratum in (*STRATA, *(f"null:{kind}" for kind in NULLS)):
+        kind = stratum.removeprefix("null:")
+        for seed in range(SEEDS):
+            words = drawn_for(stratum, ground, seed + 1000 * len(seen))
+            try:
+                (draw_case if kind == stratum else draw_null)(robot, kind, ground, *words)
+            except InputError:  # drawn anew by the caller
+                continue
+        seen[stratum], played[:] = list(played), []
+
+    def share(some: list[Setting], what: str) -> float:
+        return sum(getattr(one, what) for one in some) / len(some)
+
+    every = [one for some in seen.values() for one in some]
+    for what in ("powered", "plain", "fall", "walk"):
+        common = share(every, what)
+        assert 0.2 < common < 0.6 if ground or what in ("powered", "plain") else common == 0
+        for stratum, some in seen.items():
+            if (stratum, what) == ("unidentifiable", "powered"):
+                continue  # torque that is switched off would tell what it cannot be told by
+            chance = CHANCE * np.sqrt(common * (1 - common) / len(some))
+            assert abs(share(some, what) - common) <= chance, (stratum, what)
+    for what in ("rough", "wide"):  # as often among omissions as among nulls
+        nulls = sum(part * share(seen[f"null:{kind}"], what) for kind, part in NULLS.items())
+        missing = sum(part * share(seen[kind], what) for kind, part in STRATA.items())
+        assert missing == pytest.approx(nulls, abs=CHANCE * np.sqrt(0.25 / SEEDS / 5))
+        assert all(share(some, what) > 0 for some in seen.values())
 
 
 def test_sizes_out_of_range_are_refused() -> None:

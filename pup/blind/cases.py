@@ -10,27 +10,18 @@ from pup.blind.absorb import FAINT, MATERIAL, Reference, Visibility, readings
 from pup.blind.catalogue import COMPARABLE, KINDS
 from pup.blind.drafts import Draft, draw_case, draw_null
 from pup.blind.sensors import Noise, measure
+from pup.blind.setting import setting
 from pup.blind.sound import check
 from pup.blind.world import Effect
 from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
-STRATA = {
-    "single": 0.38,
-    "below_noise": 0.12,
-    "weak": 0.08,
-    "masked": 0.14,
-    "unidentifiable": 0.08,
-    "pair": 0.12,
-    "unlisted": 0.08,
-}
-NULLS = {"noise": 0.24, "parameters": 0.2, "coloured": 0.2, "engine": 0.2, "nuisance": 0.16}
-
 CLEAR = 10.0  # SNR from which an effect below the noise is detectable without doubt
 HIDDEN = 0.5  # share absorbed from which an effect counts as masked
 ROUNDS = 2  # of a refit that is measured
 REDRAWS, TUNINGS, CALMINGS = 30, 4, 2
+STRICT = 12  # redraws in which a case must turn out to be of the stratum that it is drawn for
 VERDICTS = ("mismatch", "none", "undetermined")
 
 
@@ -78,11 +69,11 @@ def make_case(
     """
     rng = np.random.default_rng(seed)
     kind = stratum.removeprefix("null:")
-    is_null = stratum != kind
-    for _ in range(REDRAWS):
+    draw = draw_case if stratum == kind else draw_null
+    given = setting(stratum, ground, rng)
+    for turn in range(REDRAWS):
         try:
-            draft = (draw_null if is_null else draw_case)(robot, kind, ground, rng)
-            found = _finished(draft, rng, id)
+            found = _finished(draw(robot, kind, ground, rng, given), rng, id, turn < STRICT)
         except InputError:
             continue
         if found is not None:
@@ -90,11 +81,15 @@ def make_case(
     raise InputError(f"robot {robot.name!r}: no case of stratum {stratum!r} could be made")
 
 
-def _finished(draft: Draft, rng: np.random.Generator, id: str) -> Case | None:
+def _finished(draft: Draft, rng: np.random.Generator, id: str, strict: bool) -> Case | None:
     """Simulate, tune the size to the stratum, measure and write the truth down.
 
+    Were cases taken whatever stratum they turn out to be of, the setting, which favours some, would
+    tell of it.
+
     Returns:
-      None where the effect cannot be seen, so that another must be drawn.
+      None where the effect cannot be seen, or is of another stratum and that is not allowed, so
+      that another must be drawn.
     """
     if draft.stratum.startswith("null:"):
         views: dict[str, Any] = {"all_seen": None}
@@ -112,7 +107,9 @@ def _finished(draft: Draft, rng: np.random.Generator, id: str) -> Case | None:
         each = _each(draft, reference) if len(draft.effects) > 1 else [alone]
         stratum = _label(draft.stratum, alone, draft.noise)
         faint = draft.stratum != "unidentifiable" and alone.snr < FAINT
-        missed = draft.stratum in ("single", "masked") and stratum == "weak"
+        missed = stratum != draft.stratum and (
+            strict or (draft.stratum in ("single", "masked") and stratum == "weak")
+        )
         if faint or missed or (len(each) > 1 and min(e.snr for e in each) < CLEAR):
             return None
         check(draft, reference, seen)

@@ -8,17 +8,17 @@ import numpy as np
 from pup.blind.absorb import readings
 from pup.blind.catalogue import CLASS_OF, KINDS, MASKED, available, draw, plausible, unlisted
 from pup.blind.kit import Kit
-from pup.blind.programme import USUAL, Programme, programme
+from pup.blind.programme import programme
 from pup.blind.sensors import Noise
+from pup.blind.setting import Setting
 from pup.blind.world import STEP, Effect, Engine, Nominal, Plan, World, nominal_names, steady
 from pup.errors import InputError
 from pup.robot import RobotDescription
 
 SPREAD = 0.25  # relative, of the nominal parameters
-WIDE_SPREAD = 0.6  # the same of nulls with wrong parameters
+WIDE_SPREAD = 0.6  # the same where they are far off
 SIZES = (0.5, 1.5)  # times typical
 NUISANCES, NUISANCE = 2, (0.03, 0.15)  # how many, and times typical
-ROUGH, ROUGH_GAPS = 0.15, (1 / 40, 1 / 18)  # share of rough sensors; s between ticks
 FALLEN = 0.9  # rad of roll or pitch at which a fall's recording ends
 TOLD_BY_FALLS = ("imu_delay",)
 TOLD_BY_STEPS = ("contact_restitution", "ground_friction")
@@ -89,24 +89,21 @@ def _base(
     stratum: str,
     ground: bool,
     rng: np.random.Generator,
-    spread: float = SPREAD,
-    wants: Programme = USUAL,
-    rough: bool = False,
+    given: Setting,
 ) -> Draft:
-    """Robot, sensors and plans, without effects; rough sensors have a memory and lose samples."""
-    values = _values(robot, ground, spread, rng)
+    """Robot, sensors and plans, without effects."""
+    values = _values(robot, ground, WIDE_SPREAD if given.wide else SPREAD, rng)
     nominal, seed = Nominal.of(robot, values), int(rng.integers(2**31))
     world = World(robot, nominal, seed=seed, engine=Engine(step=steady(nominal, STEP)))
     noise = Noise(position=float(rng.uniform(0.001, 0.002)), imu=float(rng.uniform(0.001, 0.003)))
-    if rough:
+    if given.rough:
         noise = replace(
             noise,
             memory=float(rng.uniform(0.4, 0.85)),
             lost=float(rng.uniform(0.003, 0.02)),
             gaps=float(rng.uniform(0.01, 0.05)),
         )
-        wants = replace(wants, gaps=ROUGH_GAPS)
-    plans = tuple(_cut(world, plan) for plan in programme(robot, ground, wants, rng))
+    plans = tuple(_cut(world, plan) for plan in programme(robot, ground, given, rng))
     return Draft(stratum, world, plans, noise, values)
 
 
@@ -119,10 +116,11 @@ def _cut(world: World, plan: Plan) -> Plan:
     return replace(plan, time=plan.time[:rows], target=plan.target[:rows])
 
 
-def draw_null(robot: RobotDescription, kind: str, ground: bool, rng: np.random.Generator) -> Draft:
+def draw_null(
+    robot: RobotDescription, kind: str, ground: bool, rng: np.random.Generator, given: Setting
+) -> Draft:
     """Nothing material is missing."""
-    spread = WIDE_SPREAD if kind == "parameters" else SPREAD
-    draft = _base(robot, f"null:{kind}", ground, rng, spread, rough=kind == "coloured")
+    draft = _base(robot, f"null:{kind}", ground, rng, given)
     if kind == "engine":
         return replace(draft, world=replace(draft.world, engine=_engine(robot.floating, rng)))
     if kind == "nuisance":
@@ -165,13 +163,13 @@ def _nuisance(kit: Kit, besides: Sequence[Effect], rng: np.random.Generator) -> 
 
 
 def draw_case(
-    robot: RobotDescription, stratum: str, ground: bool, rng: np.random.Generator
+    robot: RobotDescription, stratum: str, ground: bool, rng: np.random.Generator, given: Setting
 ) -> Draft:
     """Something is missing."""
     kit = Kit.of(robot, ground)
     if stratum == "unidentifiable":
-        return _unidentifiable(kit, rng)
-    names = _candidates(kit, stratum, rng)
+        return _unidentifiable(kit, rng, given)
+    names = _candidates(kit, stratum, rng, given)
     if stratum == "unlisted":
         effects = [draw(str(rng.choice(unlisted())), kit, rng)]
     else:
@@ -183,22 +181,17 @@ def draw_case(
             effects.append(draw(second, kit, rng))
     factor = float(rng.uniform(*SIZES))
     effects = [e.scaled(factor) for e in effects]
-    wants = Programme(
-        fall=any(e.name in TOLD_BY_FALLS for e in effects),
-        walk=any(e.name in TOLD_BY_STEPS for e in effects),
-        powered=stratum == "masked",
-        plain=stratum == "masked",
-    )
-    draft = _base(robot, stratum, ground, rng, wants=wants, rough=rng.uniform() < ROUGH)
+    draft = _base(robot, stratum, ground, rng, given)
     effects = [_stopped(draft, e) for e in effects]
     nuisance = _nuisance(kit, effects, rng) if rng.uniform() < 0.5 else ()
     world = replace(draft.world, effects=tuple(effects))
     return replace(draft, world=world, nuisance=nuisance, room=SIZES[1] / factor)
 
 
-def _candidates(kit: Kit, stratum: str, rng: np.random.Generator) -> list[str]:
+def _candidates(kit: Kit, stratum: str, rng: np.random.Generator, given: Setting) -> list[str]:
     """Effects that a stratum is drawn from; on the ground mostly those that only show there."""
-    names = list(available(kit))
+    silent = (*TOLD_BY_FALLS * (not given.fall), *TOLD_BY_STEPS * (not given.walk))
+    names = [name for name in available(kit) if name not in silent]
     local = kit.ground and rng.uniform() < 0.6  # drawn for all strata: seeds keep their meaning
     if stratum == "masked":  # none of these is of the ground or of a body
         return [n for n in names if n in MASKED]
@@ -220,13 +213,15 @@ def _stopped(draft: Draft, effect: Effect) -> Effect:
     return replace(effect, size=float(np.quantile(way, share if side > 0 else 1 - share)))
 
 
-def _unidentifiable(kit: Kit, rng: np.random.Generator) -> Draft:
+def _unidentifiable(kit: Kit, rng: np.random.Generator, given: Setting) -> Draft:
     """Effects that the recordings cannot tell apart, or cannot tell from nominal parameters."""
     robot = kit.robot
     alone = len(robot.joints) == 1
-    form = str(rng.choice(["delay", "mass", "bias"])) if alone else "delay"
-    wants = Programme(powered=True, plain=True)
-    draft = _base(robot, "unidentifiable", False, rng, wants=wants)
+    forms = ["mass", "bias"] * (alone and given.plain) + ["delay"] * given.powered
+    form = str(rng.choice(forms or ["delay"]))
+    # Torque that is switched off at once tells a late command from a late reading.
+    given = replace(given, powered=given.powered or form == "delay")
+    draft = _base(robot, "unidentifiable", False, rng, given)
     kit, factor = Kit.of(robot, False), float(rng.uniform(*SIZES))
     verdicts: tuple[str, ...] = ("mismatch", "undetermined")
     answers: tuple[str, ...]

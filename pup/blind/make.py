@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pup.blind.cases import NULLS, STRATA, make_case, strata
+from pup.blind.cases import make_case, strata
 from pup.blind.origin import generator
 from pup.blind.seal import check_cases, commit, write_key
+from pup.blind.setting import NULLS, STRATA
 from pup.errors import InputError
 from pup.files import read_json
 from pup.recording import write_recordings

@@ -13,6 +13,7 @@ from pup.sysid.excitation import script
 
 GRID = 0.0005  # s; ticks stand at whole multiples
 GAPS = (1 / 33, 1 / 25)  # s between ticks
+ROUGH_GAPS = (1 / 40, 1 / 18)  # s, the same of rough sensors
 LATE = 0.0003  # s by which a repeat's ticks differ
 DURATION = (6.0, 10.0)  # s
 ROOM = 0.004  # m between links

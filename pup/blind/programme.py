@@ -1,16 +1,16 @@
 """Which recordings a laboratory takes of one robot."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from pup.blind.motions import FEET, GAPS, LIMB, Choreographer
+from pup.blind.motions import FEET, GAPS, LIMB, ROUGH_GAPS, Choreographer
+from pup.blind.setting import Setting
 from pup.blind.world import Plan
 from pup.robot import RobotDescription
 
 REPEATED = 0.85  # share of cases with three repeats of one motion
 TESTED = 0.6  # share of cases with motions kept for the held-out score
-ANYWAY = 0.25  # share of falls and of steps among cases on the ground that do not need them
 AGAIN = 2  # repeats besides the first
 
 BENCH_LOADS = (0.15, 0.25, 0.3247, 0.45)  # kg
@@ -23,42 +23,20 @@ GAINS = (16.0, 32.0, 64.0)
 PAYLOADS = (0.0, 0.2, 0.4)  # kg
 
 
-@dataclass(frozen=True)
-class Programme:
-    """What a programme must or may not have.
-
-    Attributes:
-      gaps: shortest and longest time between ticks, s; the usual when None.
-      powered: no recording with the torque off.
-      plain: one setup throughout.
-      fall: a fall is among the training motions.
-      walk: steps are among the training motions.
-    """
-
-    gaps: tuple[float, float] | None = None
-    powered: bool = False
-    plain: bool = False
-    fall: bool = False
-    walk: bool = False
-
-
-USUAL = Programme()
-
-
 def programme(
-    robot: RobotDescription, ground: bool, wants: Programme, rng: np.random.Generator
+    robot: RobotDescription, ground: bool, given: Setting, rng: np.random.Generator
 ) -> tuple[Plan, ...]:
     """Draw the plans of a case, in random order, named without meaning.
 
     Args:
       robot: who is to play.
       ground: whether most of them are on its feet.
-      wants: what they must have.
+      given: what they must and may not have.
       rng: source of all that is random.
     """
-    maker = Choreographer(robot, rng, wants.gaps or GAPS)
-    train, test = _types(ground, wants, rng)
-    setups = _setups(robot, ground, wants.plain, rng)
+    maker = Choreographer(robot, rng, ROUGH_GAPS if given.rough else GAPS)
+    train, test = _types(ground, given, rng)
+    setups = _setups(robot, ground, given.plain, rng)
     plans = []
     for motion, on_feet, is_test in [*((m, f, False) for m, f in train), *test]:
         plan = maker.feet(motion) if on_feet else maker.limb(motion)
@@ -76,10 +54,10 @@ def programme(
 
 
 def _types(
-    ground: bool, wants: Programme, rng: np.random.Generator
+    ground: bool, given: Setting, rng: np.random.Generator
 ) -> tuple[list[tuple[str, bool]], list[tuple[str, bool, bool]]]:
     """Motion types with whether they are on the feet: training motions, then tests."""
-    limbs = [m for m in LIMB if not (wants.powered and m == "drop")]
+    limbs = [m for m in LIMB if not (given.powered and m == "drop")]
     order = [str(m) for m in rng.permutation(limbs)]
     tested = rng.uniform() < TESTED
     if not ground:
@@ -90,12 +68,10 @@ def _types(
             return [*train, *((m, False) for m in rest[: int(rng.integers(0, 2))])], []
         return train, tests
     train = [(m, True) for m in FEET] + [(m, False) for m in order[: int(rng.integers(1, 3))]]
-    # Falls and steps are also played where nothing asks for them: they shall not tell the case.
-    walked = wants.walk or rng.uniform() < ANYWAY
-    train += [("fall", True)] * (wants.fall or rng.uniform() < ANYWAY) + [("walk", True)] * walked
+    train += [("fall", True)] * given.fall + [("walk", True)] * given.walk
     if not tested:
         return train, []
-    return train, [(order[3], False, True)] + [("walk", True, True)] * (not walked)
+    return train, [(order[3], False, True)] + [("walk", True, True)] * (not given.walk)
 
 
 def _setups(
@@ -118,7 +94,7 @@ def _setups(
         if ground and "payload" in knobs:
             first["payload"] = 0.0
             options = {"supply_voltage": SUPPLIES, "payload": PAYLOADS}
-    if plain or rng.uniform() < 0.2:
+    if plain:
         return [_within(first)]
     varied = [str(k) for k in rng.permutation(list(options))[: int(rng.integers(1, 3))]]
     drawn = ({**first, k: float(rng.choice(options[k]))} for k in varied for _ in range(2))
