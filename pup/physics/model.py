@@ -53,6 +53,8 @@ class Model:
 BEYOND, MARGIN = 2.0, 0.5
 """Limits of a hinge in robot.toml may be so many times the larger end of its range in the MJCF, and
 so much more, rad; degrees beside radians are further apart."""
+LEVEL = 1 - 1e-9
+"""Least vertical part of the normal of a floor that is level."""
 TURNS = 4 * np.pi
 """Limits that a hinge without a range may have, rad."""
 
@@ -106,6 +108,8 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
             "the recording's support should be 'bench'"
         )
     _check_limits(robot, compiled)
+    if floating:
+        _check_floor(robot, compiled)
     ids = [compiled.joint(name).id for name in robot.joint_names]
     return Model(
         compiled,
@@ -139,6 +143,23 @@ def _check_limits(robot: RobotDescription, model: mujoco.MjModel) -> None:
         )
 
 
+def _check_floor(robot: RobotDescription, model: mujoco.MjModel) -> None:
+    """Refuse a floor that is not level: whoever stands on it is put down as on one that is."""
+    for floor in _floors(model):
+        up = np.empty(3)
+        mujoco.mju_rotVecQuat(up, np.array([0.0, 0.0, 1.0]), model.geom_quat[floor])
+        if up[2] < LEVEL:
+            raise InputError(
+                f"{robot.model_path}: the geom {FLOOR!r} is not level; leave its orientation out "
+                "(the effect 'ground_slope' makes the ground lean)"
+            )
+
+
+def _floors(model: mujoco.MjModel) -> list[int]:
+    """The geom that is the floor, if there is one."""
+    return [geom for geom in range(model.ngeom) if model.geom(geom).name == FLOOR]
+
+
 def joint_inertia(model: Model, armature: Array | None, shape: tuple[int, ...]) -> Array:
     """What each joint's torque accelerates at the model's reference pose, kg m².
 
@@ -155,7 +176,7 @@ def joint_inertia(model: Model, armature: Array | None, shape: tuple[int, ...]) 
 def _contacts(robot: RobotDescription, model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
     feet = [model.body(foot).id for foot in robot.feet]
     pairs = [(g, feet.index(b)) for g, b in enumerate(model.geom_bodyid) if b in feet]
-    return (*pairs, *((g, len(feet)) for g in range(model.ngeom) if model.geom(g).name == FLOOR))
+    return (*pairs, *((floor, len(feet)) for floor in _floors(model)))
 
 
 def _floor_under_the_feet(robot: RobotDescription, spec: mujoco.MjSpec) -> None:
@@ -209,9 +230,31 @@ def first_tilt(robot: RobotDescription, model: Model, recording: Recording) -> A
 def tilted(robot: RobotDescription, model: Model, roll: float, pitch: float) -> Array:
     """The torso's orientation by readings of its IMU, rad, shape (4,); NaN where one is NaN."""
     quaternion = _from_roll_pitch(roll, pitch)
-    if robot.imu_site is not None:
-        quaternion = multiply(quaternion, model.compiled.site(robot.imu_site).quat * CONJUGATE)
+    if robot.imu_site is not None and model.floating:
+        quaternion = multiply(quaternion, mount(robot, model) * CONJUGATE)
     return quaternion
+
+
+def mount(robot: RobotDescription, model: Model) -> Array:
+    """The IMU's orientation in the torso, a quaternion.
+
+    Raises:
+      InputError: it is on another body, which moves against the torso.
+    """
+    if robot.imu_site is None:
+        return np.array([1.0, 0, 0, 0])
+    compiled = model.compiled
+    site, torso = compiled.site(robot.imu_site), compiled.body(robot.torso or 0).id
+    turn, body = np.array(site.quat), int(site.bodyid[0])
+    while body != torso:
+        if body == 0 or compiled.body_jntnum[body]:
+            raise InputError(
+                f"{robot.folder / 'robot.toml'}: imu_site {robot.imu_site!r} moves against the "
+                f"torso {robot.torso!r}, whose tilt it is to tell; move it there"
+            )
+        turn = multiply(compiled.body_quat[body], turn)
+        body = int(compiled.body_parentid[body])
+    return turn
 
 
 def standing_qpos(robot: RobotDescription, model: Model, position: Array, torso: Array) -> Array:
@@ -264,7 +307,7 @@ def _feet_flat(robot: RobotDescription, model: mujoco.MjModel, data: mujoco.MjDa
 
 
 def lowest_point(model: mujoco.MjModel, places: Array, axes: Array) -> Array:
-    """Height of the lowest corner of the robot's colliding geoms, shape (...,), m.
+    """Height of the lowest corner of the robot's colliding geoms above the floor, shape (...,), m.
 
     Args:
       model: the compiled model.
@@ -278,4 +321,12 @@ def lowest_point(model: mujoco.MjModel, places: Array, axes: Array) -> Array:
     centre, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
     up = axes[..., geoms, 6:]  # what each geom's axes have of the vertical
     corner = (up * centre).sum(axis=-1) - (np.abs(up) * half).sum(axis=-1)
-    return np.asarray((places[..., geoms, 2] + corner).min(axis=-1))
+    ground = sum(places[..., floor, 2] + _top(model, floor) for floor in _floors(model))
+    return np.asarray((places[..., geoms, 2] + corner).min(axis=-1) - ground)
+
+
+def _top(model: mujoco.MjModel, geom: int) -> float:
+    """Height of a floor above its place, m."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+        return 0.0
+    return float(model.geom_aabb[geom, 2] + model.geom_aabb[geom, 5])

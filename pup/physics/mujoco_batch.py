@@ -15,8 +15,8 @@ from pup.physics.actuators import LAWS, TorqueLaw
 from pup.physics.commands import Commands
 from pup.physics.encoders import Event, History
 from pup.physics.fields import scaled
-from pup.physics.model import Model, compile_model, first_tilt, standing_qpos
-from pup.physics.outfit import as_the_imu_tells, fit_out, longest, mount
+from pup.physics.model import Model, compile_model, first_tilt, mount, standing_qpos
+from pup.physics.outfit import as_the_imu_tells, fit_out, longest
 from pup.physics.parameters import Candidates
 from pup.physics.push import Push, Pushing
 from pup.physics.rotations import multiply, roll_pitch

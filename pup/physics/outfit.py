@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pup.physics.actuators import TorqueLaw
 from pup.physics.fields import apply_fields
 from pup.physics.model import Model, joint_inertia
+from pup.physics.model import mount as mount
 from pup.physics.parameters import Candidates
 from pup.physics.terms import Scene, Term, bind_terms
 from pup.physics.writer import FieldWriter
@@ -91,10 +92,3 @@ def as_the_imu_tells(terms: Sequence[Term], torso: Array, rows: NDArray[np.int64
         if term.answers("tilt"):
             torso = term.tilt(torso, rows)
     return torso
-
-
-def mount(robot: RobotDescription, model: Model) -> Array:
-    """The IMU's orientation in the torso, a quaternion."""
-    if robot.imu_site is None:
-        return np.array([1.0, 0, 0, 0])
-    return np.array(model.compiled.site(robot.imu_site).quat)
