@@ -74,6 +74,20 @@ def command(
     return told
 
 
+def tasks(told: Sequence[str]) -> int:
+    """Cores that a command asks of Ray at least, beside those of its process.
+
+    Args:
+      told: as `command` gives it.
+    """
+    options = parser(_Parser).parse_args(list(told))
+    if not getattr(options, "address", None):
+        return 0
+    runners = getattr(options, "runners", 0)
+    least = 0 if options.name == "train" else 1
+    return max(least, runners and max(runners, options.cores or 0))
+
+
 def paths(options: argparse.Namespace) -> Iterator[Path]:
     """Files and folders that parsed arguments name."""
     for name, value in vars(options).items():

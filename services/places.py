@@ -59,7 +59,25 @@ def training(options: argparse.Namespace) -> Iterator[int]:
             f"--runners {options.runners} on {cores(options)} cores; use at most one for each core"
         )
     with connected(options.address, options.cores):
-        yield options.cores if options.address and options.cores else cores_there()
+        yield _shared_out(options) if options.address else cores_there()
+
+
+def _shared_out(options: argparse.Namespace) -> int:
+    """Cores of a cluster for a training.
+
+    Raises:
+      InputError: some runners would wait for ever.
+    """
+    from workers.cluster import cores_free
+
+    if options.cores or not options.runners:
+        return cores(options)  # without runners this process does all
+    if options.runners > (free := cores_free()):
+        raise InputError(
+            f"--runners {options.runners}, where {free} cores of the cluster are free beside this "
+            "process; use fewer, or say by --cores how many there will be on one that grows"
+        )
+    return free
 
 
 @contextmanager

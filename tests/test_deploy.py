@@ -377,6 +377,18 @@ def test_jobs_run_what_the_command_line_takes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OVERLAYS)
+def test_jobs_at_once_leave_cores_for_their_tasks(name: str) -> None:
+    container = one(overlay(name), "Deployment", "gateway")["spec"]["template"]["spec"]
+    told = {e["name"]: e["value"] for e in container["containers"][0]["env"]}
+    config = Config.read(None, {k: v for k, v in told.items() if k != DATABASE_FILE})
+    group = one(overlay(name), "RayCluster")["spec"]["workerGroupSpecs"][0]
+    limits = group["template"]["spec"]["containers"][0]["resources"]["limits"]
+    most = group["maxReplicas"] * cores_of(limits["cpu"])
+    assert config.jobs_at_once < most
+    assert config.ray_cores == (most if name == "dev" else 0)
+
+
+@pytest.mark.parametrize("name", OVERLAYS)
 def test_workers_can_hold_the_jobs(name: str) -> None:
     for job in jobs(name):
         spec = job["spec"]

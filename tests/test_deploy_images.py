@@ -250,12 +250,17 @@ def test_secrets_are_files_that_git_ignores() -> None:
         assert all(secret["file"] == f"secrets/{key}" for key, secret in made.items())
 
 
+def usual(text: str) -> str:
+    """With the values that variables have unless told otherwise."""
+    return re.sub(r"\$\{\w+:-(\w+)\}", r"\1", text)
+
+
 def test_services_are_told_what_they_read() -> None:
     lab, more = services(LAB), compose(POSTGRESQL)["services"]
     assert parser().parse_args(["serve", *lab["gateway"]["command"]]).action == "run"
     data = Path(environment("gateway")["PUP_DATA"])
     assert f"gateway:{data}" in lab["gateway"]["volumes"]
-    config = Config.read(None, lab["gateway"]["environment"])
+    config = Config.read(None, {k: usual(v) for k, v in lab["gateway"]["environment"].items()})
     head = lab["ray-head"]
     assert config.ray == f"http://{head['hostname']}:8265"
     assert f"shared:{config.shared}" in lab["gateway"]["volumes"]
@@ -268,13 +273,13 @@ def test_services_are_told_what_they_read() -> None:
         assert all(map(known, told["environment"]))
         program, verb, *words = told["command"]
         assert (program, verb) == ("ray", "start")
-        words = [re.sub(r"\$\{\w+:-(\w+)\}", r"\1", word) for word in words]
-        options = start.make_context("ray start", words).params
+        options = start.make_context("ray start", [usual(word) for word in words]).params
         assert options["block"]
         if name == "ray-head":
             assert options["head"] and options["num_cpus"] == 0
             assert {options["port"], options["dashboard_port"]} <= PORTS["cluster"]
         else:
             assert options["address"] == "ray-head:6379" and not options["head"]
+            assert options["num_cpus"] == config.ray_cores > config.jobs_at_once
     agent = services(ROBOT)["agent"]
     assert f"{Path(PLACE).parent}:{Path(PLACE).parent}:ro" in agent["volumes"]

@@ -46,6 +46,7 @@ def service(tmp_path_factory, cluster, shared):
     token = folder / "ray_token"
     token.write_text(cluster.token)
     told = {"RAY": cluster.url, "RAY_TOKEN": str(token), "SHARED": str(shared)}
+    told["JOBS_AT_ONCE"] = "3"
     with gateways.running(folder / "data", **told) as made:
         os.environ["PUP_TOKEN"] = made.tokens["operator"]
         yield made

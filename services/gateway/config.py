@@ -12,6 +12,8 @@ from services.gateway.keys import KeyRing, Tokens
 
 PREFIX = "PUP_"
 DATABASE_FILE = "PUP_DATABASE_FILE"
+NUMBERS = {"port": (0, 65535), "jobs_at_once": (1, 1000), "ray_cores": (0, 1_000_000)}
+"""Settings that are numbers, with the least and the most."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,9 @@ class Config:
       ray: URL of the dashboard of the Ray cluster that jobs run on; empty for no jobs.
       ray_token: file with the token of its authentication; empty for what Ray itself reads.
       shared: folder that the gateway and all nodes of that cluster have at the same path.
+      jobs_at_once: jobs that Ray is asked for together; more would take each other the cores that
+        their tasks need.
+      ray_cores: of that cluster, where it does not grow by itself; 0 where it does.
       recordings: folder of recordings that pages show beside those that robots sent.
       log: least level that is logged, `debug`, `info`, `warning` or `error`.
     """
@@ -50,6 +55,8 @@ class Config:
     ray: str = ""
     ray_token: str = ""
     shared: str = ""
+    jobs_at_once: int = 1
+    ray_cores: int = 0
     recordings: str = ""
     log: str = "info"
 
@@ -109,13 +116,8 @@ class Config:
     def _with(self, told: Mapping[str, Any], file: Path | None) -> "Config":
         read: dict[str, Any] = {}
         for name, value in told.items():
-            if name == "port":
-                try:
-                    read[name] = int(value)
-                except (TypeError, ValueError):
-                    read[name] = -1
-                if isinstance(value, bool) or not 0 <= read[name] < 2**16:
-                    raise InputError(f"port: {str(value)[:40]!r} is none; use 0 to 65535")
+            if name in NUMBERS:
+                read[name] = _number(name, value)
             elif not isinstance(value, str):
                 raise InputError(f"{name}: {str(value)[:40]!r} is no text")
             else:
@@ -137,6 +139,17 @@ class Config:
         if bool(config.certificate) != bool(config.key):
             raise InputError("certificate and key belong together; give both or none")
         return config
+
+
+def _number(name: str, value: Any) -> int:
+    least, most = NUMBERS[name]
+    try:
+        number = least - 1 if isinstance(value, bool) else int(value)
+    except (TypeError, ValueError):
+        number = least - 1
+    if not least <= number <= most:
+        raise InputError(f"{name}: {str(value)[:40]!r} is none; use {least} to {most}")
+    return number
 
 
 def _held(file: Path) -> str:

@@ -24,7 +24,7 @@ from services.gateway.jobs import Job, JobState, Seen, Status, reconciled
 from services.gateway.metrics import Metrics
 from services.gateway.ray_jobs import RayAwayError, RayJobs
 from services.gateway.store import Event, ReplacedError, Store
-from services.job_arguments import RESUMABLE, command
+from services.job_arguments import RESUMABLE, command, tasks
 from services.job_folder import JobFolder, Order, folder_of
 
 log = logging.getLogger(__name__)
@@ -52,6 +52,8 @@ class Dispatcher:
       shared: root of the shared storage.
       metrics: counts.
       notify: tells whoever waits that a job changed.
+      at_once: jobs that Ray is asked for together; see Config.
+      cores: of the cluster; 0 where it grows by itself.
     """
 
     def __init__(
@@ -61,9 +63,12 @@ class Dispatcher:
         shared: Path,
         metrics: Metrics,
         notify: Callable[[str], None],
+        at_once: int = 1,
+        cores: int = 0,
     ) -> None:
         self.store, self.ray, self.shared = store, ray, shared
         self.metrics, self.notify = metrics, notify
+        self.at_once, self.cores = at_once, cores
         self.jobs: dict[str, Job] = {}
         self.trouble = ""
         """What all jobs wait for, in words, or empty."""
@@ -71,6 +76,7 @@ class Dispatcher:
         self._stopped: ReplacedError | None = None
         self._locks: dict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._sizes: dict[str, int] = {}
+        self._turn: set[str] = set()
 
     async def load(self) -> None:
         """Read the store."""
@@ -97,6 +103,7 @@ class Dispatcher:
         except RayAwayError as error:
             self._away = f"the Ray cluster, which {error}"
         self.metrics.ray.set(not self._away)
+        self._turn = self._due()
         room = asyncio.Semaphore(AT_ONCE)
 
         async def look(name: str) -> None:
@@ -105,6 +112,18 @@ class Dispatcher:
 
         await asyncio.gather(*(look(job.id) for job in self.jobs.values() if job.open))
         self._say(self._away or self._failed)
+
+    def _due(self) -> set[str]:
+        """Queued jobs whose turn it is, the first ones that came.
+
+        A job's process holds its cores while its tasks wait for some: too many would wait for ever.
+        """
+        now = time.time()
+        queued = [j.id for j in self.jobs.values() if j.state is JobState.QUEUED and j.due <= now]
+        return set(queued[: max(0, self.at_once - self._under_way())])
+
+    def _under_way(self) -> int:
+        return sum(j.open and j.state is not JobState.QUEUED for j in self.jobs.values())
 
     def job(self, name: str) -> Job:
         """A job by its id.
@@ -145,9 +164,8 @@ class Dispatcher:
                 return before, False
             if sum(j.open for j in self.jobs.values()) >= OPEN_LIMIT:
                 raise NoJobsError(f"{OPEN_LIMIT} jobs wait already")
-            folder = folder_of(self.shared, job.id)
-            command(job.verb, job.arguments, folder.out, job.cpus, self.shared)
             try:
+                await asyncio.to_thread(self._check, job)
                 await asyncio.to_thread(self._order, job, 0)
             except OSError as error:
                 told = f"the shared storage takes no files ({error.strerror or error})"
@@ -192,6 +210,8 @@ class Dispatcher:
             return self.trouble
         if job.state is JobState.QUEUED and (left := job.due - time.time()) > 0:
             return f"its next attempt, in {left:.0f} s"
+        if job.state is JobState.QUEUED and self._under_way() >= self.at_once:
+            return "other jobs"
         return "room on the Ray cluster" if job.state is JobState.WAITING else ""
 
     def measure(self) -> None:
@@ -219,7 +239,7 @@ class Dispatcher:
 
     async def _attempt(self, job: Job) -> None:
         """Store a new attempt, then ask Ray for it."""
-        if self._away or time.time() < job.due:
+        if self._away or job.id not in self._turn:
             return
         before, job = job, job.attempted(time.time())
         try:
@@ -272,6 +292,16 @@ class Dispatcher:
         if self._sizes.get(job.id) != size:
             self._sizes[job.id] = size
             self.notify(LIST + job.id)
+
+    def _check(self, job: Job) -> None:
+        """Refuse what the verb would refuse, and what finds no room on a cluster of fixed size."""
+        out = folder_of(self.shared, job.id).out
+        asked = job.cpus + tasks(command(job.verb, job.arguments, out, job.cpus, self.shared))
+        if self.cores and asked > self.cores:
+            raise InputError(
+                f"needs {asked:g} cores, {job.cpus:g} for its process (--cpus) and the others for "
+                f"its tasks; the cluster has {self.cores}"
+            )
 
     def _order(self, job: Job, attempt: int) -> None:
         """Tell the job's process what to do."""

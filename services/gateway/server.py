@@ -87,7 +87,15 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
     ray = RayJobs(config.ray, token_of(config.ray_token)) if config.ray else None
     store, fits, metrics = Store(config.url), Fits(), Metrics()
     conductor = Conductor(store, fits, metrics)
-    dispatcher = Dispatcher(store, ray, Path(config.shared), metrics, conductor.notify)
+    dispatcher = Dispatcher(
+        store,
+        ray,
+        Path(config.shared),
+        metrics,
+        conductor.notify,
+        config.jobs_at_once,
+        config.ray_cores,
+    )
     link = Link(config, ring, conductor)
     try:
         await conductor.load()

@@ -1,0 +1,122 @@
+"""Jobs that would starve each other of cores come one after the other; a Ray that only answers."""
+
+import argparse
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("fastapi")
+
+from pup.errors import InputError
+from services.gateway.dispatcher import Dispatcher
+from services.gateway.jobs import Job, JobState, Seen, Status
+from services.gateway.metrics import Metrics
+from services.gateway.store import Store
+from services.job_arguments import command, tasks
+from services.job_folder import Outcome
+from services.places import training
+from workers.cluster import connected, staying
+
+FIT = ("recordings", "--robot", "servo_bench")
+OUT = Path("out")
+
+
+class Ray:
+    """A cluster that finds room for no job."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    async def check(self) -> None:
+        """It is there."""
+
+    async def submit(self, submission: str, entrypoint: str, cpus: float, gpus: float) -> None:
+        self.asked.append(submission)
+
+    async def seen(self, submission: str) -> Seen:
+        return Seen(Status.PENDING if submission in self.asked else Status.UNKNOWN)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    (tmp_path / "recordings").mkdir()
+    made = Store(f"sqlite:///{tmp_path / 'gateway.db'}")
+    yield made
+    made.close()
+
+
+def job(**more: float) -> Job:
+    return Job("", "presysid", FIT, "ann", 0.0, **more)  # type: ignore[arg-type]
+
+
+def test_jobs_wait_for_those_before_them(store: Store, tmp_path: Path) -> None:
+    async def told() -> None:
+        ray = Ray()
+        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)  # type: ignore[arg-type]
+        names = [(await jobs.submit(job(), None))[0].id for _ in range(3)]
+        for number, name in enumerate(names):
+            for _ in range(2):
+                await jobs.tick()
+            assert ray.asked == [f"{name}-1" for name in names[: number + 1]]
+            assert jobs.waits_for(jobs.job(name)) == "room on the Ray cluster"
+            for later in names[number + 1 :]:
+                assert jobs.job(later).state is JobState.QUEUED
+                assert jobs.waits_for(jobs.job(later)) == "other jobs"
+            jobs.folder(name).write_outcome(Outcome(1, 0))
+            await jobs.tick()
+            assert jobs.job(name).state is JobState.SUCCEEDED
+
+    asyncio.run(told())
+
+
+def test_what_never_finds_room_is_refused(store: Store, tmp_path: Path) -> None:
+    async def told(cores: int, **more: float) -> None:
+        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None, 1, cores)  # type: ignore[arg-type]
+        await jobs.submit(job(**more), None)
+
+    asyncio.run(told(2))
+    asyncio.run(told(0, cpus=64))
+    with pytest.raises(InputError, match=r"needs 3 cores.*--cpus.*has 2"):
+        asyncio.run(told(2, cpus=2))
+
+
+@pytest.mark.parametrize(
+    ("cores", "verb", "arguments"),
+    [
+        (1, "presysid", FIT),
+        (0, "presysid", (*FIT, "--local")),
+        (0, "replay", FIT),
+        (0, "train", ()),
+        (2, "train", ("--runners", "2")),
+        (8, "train", ("--runners", "2", "--cores", "8")),
+    ],
+)
+def test_cores_that_a_job_takes_beside_its_process(
+    cores: int, verb: str, arguments: tuple[str, ...]
+) -> None:
+    assert tasks(command(verb, arguments, OUT)) == cores
+
+
+@pytest.mark.ray
+def test_runners_share_what_is_free_beside_the_process() -> None:
+    import ray
+
+    @ray.remote(num_cpus=1)
+    class Process:
+        """Holds a core, as Ray does for the process of a job."""
+
+        def ready(self) -> None: ...
+
+    def options(runners: int) -> argparse.Namespace:
+        return argparse.Namespace(address="there", cores=None, runners=runners)
+
+    with staying(), connected(cores=3):
+        process = Process.remote()
+        ray.get(process.ready.remote())
+        with training(options(2)) as cores:
+            assert cores == 2
+        refused = pytest.raises(InputError, match="2 cores of the cluster are free")
+        with refused, training(options(3)):
+            pass
