@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ pytest.importorskip("fastapi")
 
 from pup.errors import InputError
 from services.gateway.dispatcher import Dispatcher
+from services.gateway.job_routes import document
 from services.gateway.jobs import Job, JobState, Seen, Status
 from services.gateway.metrics import Metrics
 from services.gateway.store import Store
@@ -120,3 +122,22 @@ def test_runners_share_what_is_free_beside_the_process() -> None:
         refused = pytest.raises(InputError, match="2 cores of the cluster are free")
         with refused, training(options(3)):
             pass
+
+
+def test_storage_that_hangs_takes_no_threads_of_others(store: Store, tmp_path: Path) -> None:
+    async def told() -> None:
+        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None)  # type: ignore[arg-type]
+        made, _ = await jobs.submit(job(), None)
+        log = jobs.folder(made.id).log
+        os.mkfifo(log)  # who opens it waits, as on a mount whose server is gone
+        asked = [asyncio.create_task(document(jobs, made)) for _ in range(64)]
+        try:
+            await asyncio.sleep(0.2)
+            assert not any(task.done() for task in asked)
+            assert await asyncio.wait_for(asyncio.to_thread(lambda: "link"), 10) == "link"
+        finally:
+            end = os.open(log, os.O_RDWR)
+            await asyncio.gather(*asked)
+            os.close(end)
+
+    asyncio.run(told())

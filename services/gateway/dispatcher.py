@@ -23,6 +23,7 @@ from services.gateway.conductor import UnknownError
 from services.gateway.jobs import Job, JobState, Seen, Status, reconciled
 from services.gateway.metrics import Metrics
 from services.gateway.ray_jobs import RayAwayError, RayJobs
+from services.gateway.storage import on_storage
 from services.gateway.store import Event, ReplacedError, Store
 from services.job_arguments import RESUMABLE, command, tasks
 from services.job_folder import JobFolder, Order, folder_of
@@ -165,8 +166,8 @@ class Dispatcher:
             if sum(j.open for j in self.jobs.values()) >= OPEN_LIMIT:
                 raise NoJobsError(f"{OPEN_LIMIT} jobs wait already")
             try:
-                await asyncio.to_thread(self._check, job)
-                await asyncio.to_thread(self._order, job, 0)
+                await on_storage(self._check, job)
+                await on_storage(self._order, job, 0)
             except OSError as error:
                 told = f"the shared storage takes no files ({error.strerror or error})"
                 raise NoJobsError(told) from error
@@ -183,7 +184,7 @@ class Dispatcher:
             if (now := job.cancel(who)) != job:
                 await self._write(now, Event("cancelled", who))
                 if now.open:
-                    await asyncio.to_thread(folder_of(self.shared, name).revoke)
+                    await on_storage(folder_of(self.shared, name).revoke)
         await self._look(name)
         return self.job(name)
 
@@ -243,7 +244,7 @@ class Dispatcher:
             return
         before, job = job, job.attempted(time.time())
         try:
-            await asyncio.to_thread(self._order, job, job.last.number)
+            await on_storage(self._order, job, job.last.number)
         except InputError as error:  # a newer program may refuse what an older one took
             failed = replace(before, state=JobState.FAILED, reason=str(error))
             await self._write(failed, Event("failed"))
@@ -263,14 +264,14 @@ class Dispatcher:
         """See what became of the attempt under way."""
         assert self.ray is not None
         folder, number = folder_of(self.shared, job.id), job.last.number
-        outcome = await asyncio.to_thread(folder.outcome, number)
-        claimed = await asyncio.to_thread(folder.claimed, number)
+        outcome = await on_storage(folder.outcome, number)
+        claimed = await on_storage(folder.claimed, number)
         seen = Seen(Status.AWAY)
         if not self._away:
             seen = await self.ray.seen(_submission(job))
         now = reconciled(job, seen, outcome, claimed, time.time())
         if now.last.ended is not None and now.state is not JobState.SUCCEEDED:
-            await asyncio.to_thread(folder.revoke)  # it may live on behind a cut
+            await on_storage(folder.revoke)  # it may live on behind a cut
         if now != job:
             await self._write(now, None if now.state is job.state else Event(now.state.value))
         if now.open and now.state is not JobState.QUEUED:
@@ -288,7 +289,7 @@ class Dispatcher:
     async def _heard(self, job: Job) -> None:
         """Tell whoever watches that there is more to read."""
         folder = folder_of(self.shared, job.id)
-        size = await asyncio.to_thread(folder.log_size)
+        size = await on_storage(folder.log_size)
         if self._sizes.get(job.id) != size:
             self._sizes[job.id] = size
             self.notify(LIST + job.id)

@@ -19,6 +19,7 @@ from services.gateway.keys import Role, User
 from services.gateway.problems import responses
 from services.gateway.records import Row, job_document
 from services.gateway.shapes import WITHOUT_FRACTION, Retry, Strict
+from services.gateway.storage import on_storage
 from services.job_arguments import COUNT, LENGTH, Verb
 
 CHUNK = 2**16
@@ -110,7 +111,7 @@ def dispatcher_of(request: Request) -> Dispatcher:
 async def document(dispatcher: Dispatcher, job: Job) -> Row:
     """A job as it is told, with what it waits for and the last line that it said."""
     folder = dispatcher.folder(job.id)
-    progress = await asyncio.to_thread(folder.last_line)
+    progress = await on_storage(folder.last_line)
     return job_document(job) | {"waits_for": dispatcher.waits_for(job), "progress": progress}
 
 
@@ -130,7 +131,7 @@ async def artifacts(dispatcher: Dispatcher, job: Job) -> list[Row]:
             told.append(row)
         return told
 
-    return await asyncio.to_thread(listed)
+    return await on_storage(listed)
 
 
 @router.get("/jobs", response_model=JobList, responses=READ)
@@ -219,7 +220,7 @@ async def get_logs(
         at, path = offset, dispatcher.folder(job).log
         while True:
             over = not dispatcher.job(job).open
-            while chunk := await asyncio.to_thread(_read, path, at):
+            while chunk := await on_storage(_read, path, at):
                 at += len(chunk)
                 yield chunk
             if over or not follow or request.app.state.stopping or asking(request) is None:
@@ -244,7 +245,7 @@ async def list_artifacts(request: Request, _: Viewer, job: JobName) -> Response:
 async def get_artifact(request: Request, _: Viewer, job: JobName, name: str) -> Response:
     """A file that a job wrote; ranges of bytes can be had."""
     folder = dispatcher_of(request).folder(job)
-    path = await asyncio.to_thread(folder.file, name)
+    path = await on_storage(folder.file, name)
     if path is None:
         raise HTTPException(404, f"{job} has no artefact {name[:200]}")
     return FileResponse(path, media_type="application/octet-stream", filename=path.name)

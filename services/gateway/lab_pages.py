@@ -24,6 +24,7 @@ from services.gateway.html import login, page, part
 from services.gateway.job_routes import dispatcher_of
 from services.gateway.jobs import Job
 from services.gateway.recordings import Shelves
+from services.gateway.storage import on_storage
 
 T = TypeVar("T", bound=Document)
 V = TypeVar("V")
@@ -63,7 +64,7 @@ async def start(request: Request) -> Response:
     conductor, jobs = conductor_of(request), dispatcher_of(request).newest()
     agents = conductor.agents.values()
     tiles = [
-        await asyncio.to_thread(_recordings_tile, _shelves(request)),
+        await on_storage(_recordings_tile, _shelves(request)),
         _tile(BOUNDS, await _documents(request, BOUNDS)),
         _tile(TRAINING, await _documents(request, TRAINING)),
         Tile("Studies", "/studies", _counted(s.state for s in conductor.studies.values())),
@@ -80,7 +81,7 @@ async def recordings(request: Request) -> Response:
     if (user := asking(request)) is None:
         return login()
     shelves = _shelves(request)
-    told = [(name, *await asyncio.to_thread(shelves.listed, name)) for name in shelves.folders]
+    told = [(name, *await on_storage(shelves.listed, name)) for name in shelves.folders]
     return page("recordings.html", request, user, shelves=told)
 
 
@@ -90,7 +91,7 @@ async def one_recording(request: Request, shelf: str, name: str) -> Response:
     if (user := asking(request)) is None:
         return login()
     shelves = _shelves(request)
-    file = shelves.file(shelf, name)
+    file = await on_storage(shelves.file, shelf, name)
     try:
         found = await shelves.read(file)
     except InputError as error:
@@ -146,7 +147,7 @@ async def one_training(request: Request, job: str) -> Response:
     found = await _of_job(request, TRAINING, job)
     name = part(request, "training_one.html", "training_one_live.html")
     told = await _drawn(found, lambda d: charts.curves(d.curve))
-    line = await asyncio.to_thread(dispatcher_of(request).folder(job).last_line)
+    line = await on_storage(dispatcher_of(request).folder(job).last_line)
     return page(name, request, user, job=_job(request, job), trainings=told, line=line)
 
 
@@ -170,7 +171,7 @@ async def report(request: Request, job: str, name: str) -> Response:
     """A report that a job wrote, as it is; other files that reports link to are downloads."""
     if asking(request) is None:
         return login()
-    path = await asyncio.to_thread(dispatcher_of(request).folder(job).file, name)
+    path = await on_storage(dispatcher_of(request).folder(job).file, name)
     if path is None:
         raise HTTPException(404, f"{job} has no artefact {name[:200]}")
     if path.suffix != ".html":
@@ -189,13 +190,13 @@ async def _list(request: Request, kind: Kind[T]) -> Response:
 
 async def _documents(request: Request, kind: Kind[T]) -> list[Artefact[T]]:
     dispatcher = dispatcher_of(request)
-    return await asyncio.to_thread(artefacts.of_jobs, kind, dispatcher.newest(), dispatcher.shared)
+    return await on_storage(artefacts.of_jobs, kind, dispatcher.newest(), dispatcher.shared)
 
 
 async def _of_job(request: Request, kind: Kind[T], name: str) -> list[Artefact[T]]:
     dispatcher = dispatcher_of(request)
     job = dispatcher.job(name)
-    return await asyncio.to_thread(artefacts.of_job, kind, job, dispatcher.shared)
+    return await on_storage(artefacts.of_job, kind, job, dispatcher.shared)
 
 
 async def _drawn(

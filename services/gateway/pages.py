@@ -1,6 +1,5 @@
 """The pages of what goes on: studies, jobs, one of them, agents. Nothing comes from elsewhere."""
 
-import asyncio
 import logging
 import math
 from pathlib import Path
@@ -18,6 +17,7 @@ from services.gateway.html import login, page, part
 from services.gateway.keys import Tokens
 from services.gateway.posteriors import NOTHING
 from services.gateway.records import study_document, trial_document
+from services.gateway.storage import on_storage
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +147,7 @@ async def one_job(request: Request, job: str) -> Response:
         ways=ways(found, [file["name"] for file in files]),
         artifacts=files[:ARTIFACTS],
         more=len(files[ARTIFACTS:]),
-        log=await asyncio.to_thread(dispatcher.folder(job).tail, LOG),
+        log=await on_storage(dispatcher.folder(job).tail, LOG),
     )
 
 

@@ -11,6 +11,7 @@ from pup.errors import InputError
 from pup.recording import Recording
 from pup.recording_file import Header, read_header
 from services.gateway.conductor import UnknownError
+from services.gateway.storage import on_storage
 from services.job_folder import below, inside
 
 LISTED = 500
@@ -72,7 +73,7 @@ class Shelves:
           InputError: it cannot be read, or is too large; the message is one line.
         """
         async with self._drawing:
-            return await asyncio.to_thread(_read, path)
+            return await on_storage(_read, path)
 
     def _folder(self, shelf: str) -> Path:
         if shelf not in self.folders:
