@@ -59,7 +59,7 @@ def test_a_job_joins_the_cluster_and_writes_to_its_folder():
         ("presysid", (*FIT, "a\nb"), "cannot be printed"),
         ("presysid", ("x",) * 257, "more than 256"),
         ("presysid", ("x" * 1025,), "more than"),
-        ("record", ("step", "--robot", "servo_bench", "--truth", "t.json"), "--truth"),
+        ("record", ("step", "--robot", "servo_bench", "--virtual", "--truth", "t.json"), "--truth"),
         ("; rm -rf /", (), "cannot be a job"),
     ],
 )
