@@ -19,6 +19,7 @@ from pup.physics.model import Model, compile_model, first_tilt, mount, standing_
 from pup.physics.outfit import as_the_imu_tells, fit_out, longest
 from pup.physics.parameters import Candidates
 from pup.physics.push import Push, Pushing
+from pup.physics.rest import ticks_at_rest
 from pup.physics.rotations import multiply, roll_pitch
 from pup.physics.servo import Servos
 from pup.physics.simulator import Schedule, Trajectories, schedule, tick_slices
@@ -51,6 +52,7 @@ class Group:
       power: share of torque on, shape (n_steps, n_recordings).
       running: how many recordings still run in each sub-step.
       events: the ticks in each sub-step.
+      rests: which recordings begin at rest on the ground, shape (n_recordings,).
     """
 
     members: tuple[int, ...]
@@ -63,6 +65,7 @@ class Group:
     power: Array
     running: NDArray[np.int64]
     events: tuple[Event | None, ...]
+    rests: NDArray[np.bool_]
 
 
 class MujocoSimulator:
@@ -170,6 +173,7 @@ class MujocoSimulator:
             power=np.ascontiguousarray(power),
             running=np.sum([np.arange(steps) < p.steps for p in ordered], axis=0),
             events=_events(ordered, [self.ticks[i].start for i in members], steps),
+            rests=np.array([ticks_at_rest(self.recordings[i]) > 1 for i in members]),
         )
 
 
@@ -239,8 +243,6 @@ class Run:
 
     def _start(self, nsim: int) -> None:
         """Put the simulations where the recordings start."""
-        for term in self.terms:
-            term.prepare()  # by the scene that the terms' model fields have changed
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qpos[:] = self._starting_qpos()
         velocity = np.repeat(self.group.start_velocity, self.candidates, axis=0)
@@ -251,27 +253,65 @@ class Run:
             wrenches = self.batch.bind("xfrc_applied")
             for term in pushing:
                 term.push(wrenches)
+        self.acceleration = self.batch.bind("qacc")
+        self.bias = self.batch.bind("qfrc_bias")
+        sensed = self._begun(nsim)
+        trains = [term for term in self.terms if isinstance(term, Drivetrain)]
+        for train in trains:
+            self._bend(train)
+            sensed = self._begun(nsim, train.rows)
         # Velocities stand half a sub-step before positions, see `simulator`.
-        acceleration, bias = self.batch.bind("qacc"), self.batch.bind("qfrc_bias")
-        model = self.group.model
-        sensed = self.servos.sense(self.qpos[:, model.qpos], self.qvel[:, model.dofs])
-        self._drive(0, nsim, sensed)
-        self.servos.begin()
-        self.batch.forward()
-        behind = self.batch.model.opt.timestep / 2 * acceleration
-        for term in self.terms:
-            if isinstance(term, Drivetrain):
-                behind[term.rows] = self._tried(term, sensed)
+        behind = self.batch.model.opt.timestep / 2 * self.acceleration
+        for train in trains:
+            behind[train.rows] = self._tried(train, sensed)
         self.qvel -= behind
+        load = self._load(trains)
         for term in self.terms:
             term.prepare()
         holding = [term for term in self.terms if term.answers("held")]
-        if holding and not model.floating:  # on the floor, contacts hold too
-            gravity = bias[:, model.dofs]
-            load = gravity - self.force[:, model.dofs]
-            on = np.repeat(self.group.power[0], self.candidates)[:, None]
+        if not self.group.model.floating:  # on the floor, contacts hold too
             for term in holding:
-                load = term.held(load, on * gravity)
+                load = term.held(load, self._gravity())
+
+    def _begun(self, nsim: int, rows: NDArray[np.int32] | None = None) -> tuple[Array, Array]:
+        """What encoders tell at the start, with the first torques; accelerations of some rows."""
+        model = self.group.model
+        for term in self.terms:
+            term.prepare()  # by the scene that the terms' model fields have changed
+        sensed = self.servos.sense(self.qpos[:, model.qpos], self.qvel[:, model.dofs])
+        self._drive(0, nsim, sensed)
+        self.servos.begin()
+        self.batch.forward(ids=rows)
+        return sensed
+
+    def _gravity(self) -> Array:
+        """What joints need of torque that is on, N m."""
+        on = np.repeat(self.group.power[0], self.candidates)[:, None]
+        return np.asarray(on * self.bias[:, self.group.model.dofs])
+
+    def _bend(self, train: Drivetrain) -> None:
+        """Start motors that reach links through play or give where they hold these.
+
+        Where contacts hold too, it is known of robots that rest: their servos tell it.
+        """
+        model = self.group.model
+        rests = np.repeat(self.group.rests, self.candidates)[:, None]
+        torque = np.where(rests, train.driven, 0.0) if model.floating else self._gravity()
+        seen = train.bend(torque)
+        position = self.qpos[:, model.qpos] - seen
+        if not model.floating:
+            self.qpos[:, model.qpos] = position
+            return
+        for row in np.flatnonzero(seen.any(axis=1)):
+            self.qpos[row] = standing_qpos(self.robot, model, position[row], self.qpos[row, 3:7])
+
+    def _load(self, trains: Sequence[Drivetrain]) -> Array:
+        """What joints at rest need beside all torques told, N m; see Term.held."""
+        dofs = self.group.model.dofs
+        load = np.asarray(self.bias[:, dofs] - self.force[:, dofs])
+        for train in trains:
+            load -= train.short()
+        return load
 
     def _tried(self, train: Drivetrain, sensed: tuple[Array, Array]) -> Array:
         """Half of the velocity that links gain in a first sub-step, which is then undone.

@@ -168,6 +168,7 @@ def follow(
     torque: Array,
     damping: Array,
     first: Array,
+    start: Array,
     active: Mask,
     gap: Array,
     play_seen: Array,
@@ -190,6 +191,7 @@ def follow(
       torque: that has reached the link, N m.
       damping: the same times the link's velocity, N m s/rad.
       first: velocity with which a motor starts, rad/s; NaN for the link's.
+      start: by how much it starts ahead of the link, rad.
       active: where there is a motor of its own.
       gap: half of the play, rad.
       play_seen: share of the play that the encoder sees.
@@ -207,7 +209,7 @@ def follow(
             speed[i, j] = now
             own[i, j] += timestep[i, 0] * now
             if math.isnan(own[i, j]):
-                own[i, j] = position[i, j]
+                own[i, j] = position[i, j] + start[i, j]
             told[i, j], felt[i, j] = position[i, j], velocity[i, j]
             if active[i, j]:
                 ahead = own[i, j] - position[i, j]

@@ -62,6 +62,9 @@ class Drivetrain(Term):
     Args:
       parts: the play and the give.
       scene: what they act on.
+
+    Attributes:
+      driven: torque of the motors in the last sub-step, (n_simulations, n_joints), N m.
     """
 
     effect = "drivetrain"
@@ -78,6 +81,8 @@ class Drivetrain(Term):
         self._bend_seen = bend / np.maximum(self._give, 1e-12)
         self._active = (self._gap > 0) | (self._give > 0)
         self._first = np.full_like(self._gap, np.nan)
+        self._ahead = np.zeros_like(self._gap)
+        self.driven = np.zeros_like(self._gap)
         super().__init__({}, scene)
 
     @property
@@ -121,6 +126,7 @@ class Drivetrain(Term):
             self._torque,
             self._damping,
             self._first,
+            self._ahead,
             self._active,
             self._gap,
             self._play_seen,
@@ -128,6 +134,23 @@ class Drivetrain(Term):
             self._step,
         )
         return told, felt
+
+    def bend(self, torque: Array) -> Array:
+        """Let motors start where they have long passed on a torque.
+
+        Args:
+          torque: (n_simulations, n_joints), N m.
+
+        Returns:
+          What encoders see of it that are not behind it, same shape, rad.
+        """
+        play, give = np.sign(torque) * self._gap, torque * self._give
+        self._ahead = play + give
+        return np.asarray(play * self._play_seen + give * self._bend_seen)
+
+    def short(self) -> Array:
+        """By how much less of the motors' torques reached the links than they had, N m."""
+        return np.where(self._active, self.driven - self._torque, 0.0)
 
     def tried(self, position: Array, velocity: Array, before: Array) -> None:
         """Learn from a first sub-step how fast the motors are half a sub-step before the start.
@@ -146,6 +169,7 @@ class Drivetrain(Term):
         # Without a motor of its own, what turns a link bears the joint's damping, too.
         driven = flow.carried() + flow.brake + flow.viscous * flow.coming
         flow.motor = np.where(self._active[:n], driven, np.nan)
+        self.driven[:n] = driven
         begin(before, flow.link)
         flow.velocity, flow.coming = flow.link, 2 * flow.link - before
         before[:] = flow.link
