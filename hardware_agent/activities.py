@@ -268,13 +268,14 @@ class Walk:
 
 @dataclass(eq=False)
 class Play:
-    """Wait in a script's first pose, and play it when told to.
+    """Wait in a script's first pose, play it when told to, and go home.
 
     Attributes:
       script: which.
       ramp: time from one pose to the next on the way home, s.
       emit: tells of it.
       go: set when it may begin.
+      alone: on the ground, once it has begun, but where the robot is to fall.
       rows: of its ticks so far.
     """
 
@@ -286,6 +287,7 @@ class Play:
     alone: bool = False
     ready: float | None = None
     begun: float | None = None
+    home: Activity | None = None
     rows: list[Row] = field(default_factory=list)
 
     def step(self, senses: Senses) -> tuple[Array, Activity]:
@@ -293,30 +295,41 @@ class Play:
         if self.ready is None:
             self.ready = senses.time
             self.emit(Ready(self.script))
-        rested = senses.time - self.ready >= REST
         if self.begun is None:
-            if not (self.go and rested):
+            if not self.go or senses.time - self.ready < REST:
                 return self.script.target[0], self
             self.begun = senses.time
+            self.alone = self.script.support == "ground" and not self.script.falls
         time = self._time(senses)
-        if time > self.script.duration + 1e-9 or (self.script.falls and _fallen(senses)):
-            self.emit(Played(self.script, self.rows))
-            return self._home().step(senses)
-        return self.script.at(time), self
+        if self.home is None and time <= self.script.duration + 1e-9 and not self._lies(senses):
+            return self.script.at(time), self
+        return self._return(senses)
 
     def keep(self, senses: Senses, applied: Applied) -> None:
         """Add a tick to what is recorded."""
-        if self.begun is not None:
+        if self.begun is not None and self.home is None:
             self.rows.append(Row(self._time(senses), senses, applied))
+
+    def _return(self, senses: Senses) -> tuple[Array, Activity]:
+        """Home; the script is over when the robot is there."""
+        if self.home is None:
+            self.home = along((self.script.target[-1], *self.script.back), self.ramp)
+        after: Activity = Lie()
+        target = senses.goal
+        if not self.script.falls:
+            target, after = self.home.step(senses)
+        if isinstance(after, Hold | Lie):
+            self.emit(Played(self.script, self.rows))
+            return target, after
+        self.home = after
+        return target, self
+
+    def _lies(self, senses: Senses) -> bool:
+        return self.script.falls and fallen(senses)
 
     def _time(self, senses: Senses) -> float:
         assert self.begun is not None
         return round(senses.time - self.begun, 9)
-
-    def _home(self) -> Activity:
-        if self.script.falls:
-            return Lie()
-        return along((self.script.target[-1], *self.script.back), self.ramp)
 
 
 def along(poses: Sequence[Array], ramp: float, then: Activity | None = None) -> Activity:
@@ -333,7 +346,8 @@ def along(poses: Sequence[Array], ramp: float, then: Activity | None = None) -> 
     return activity
 
 
-def _fallen(senses: Senses) -> bool:
+def fallen(senses: Senses) -> bool:
+    """Whether the robot leans as far as one that falls as it should."""
     imu = senses.imu
     return imu is not None and max(abs(imu.roll), abs(imu.pitch)) > FALLEN
 

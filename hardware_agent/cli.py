@@ -16,7 +16,7 @@ from pup.errors import InputError
 
 DONE, FAILED, REFUSED = 0, 1, 2
 PLACE = "/etc/pup-agent/agent.toml"
-SCRIPTS = "file of `pup record --scripts`, which the agent can read, or a folder of them"
+SCRIPTS = "file of `pup record --scripts`, or a folder of them"
 MOST = 100  # repeats of a script
 
 
@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
         elif name == "play":
             verb.add_argument("scripts", type=Path, nargs="+", metavar="SCRIPT", help=SCRIPTS)
             verb.add_argument("--repeats", type=int, default=1, metavar="N", help="of each script")
-            verb.add_argument("--auto", action="store_true", help="ask nobody; see control.gate")
+            verb.add_argument("--auto", action="store_true", help='ask nobody; needs gate = "auto"')
         elif name == "keys":
             verb.add_argument("name", help="of the files NAME.key and NAME.key_secret")
             verb.add_argument("--out", type=Path, required=True, metavar="DIR")

@@ -12,7 +12,7 @@ from typing import Any
 
 from pup.errors import InputError
 
-LONGEST = 65536  # bytes of a line
+LONGEST = 2**20  # bytes of a line
 PATIENCE = 10.0  # s, for an answer
 
 Answer = Callable[[dict[str, Any]], dict[str, Any]]

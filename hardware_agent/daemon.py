@@ -298,7 +298,7 @@ class Agent:
         if command["do"] == "play":
             self._scripts.play(stopped)
         elif self._conductor.stage in (Stage.NONE, Stage.WAITING):
-            self._scripts.pose(command.get("script"), stopped)
+            self._scripts.pose(command.get("script"), command.get("repeat_of"), stopped)
         else:
             raise InputError("a trial is under way")
 

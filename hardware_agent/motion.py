@@ -21,6 +21,7 @@ from hardware_agent.activities import (
     Settle,
     Walk,
     along,
+    fallen,
     script_of,
     trial_of,
 )
@@ -112,7 +113,7 @@ class Motion(Loop):
 
     def play(self, stopped: Callable[[], bool]) -> Refused | None:
         """Play the script whose first pose the robot is in."""
-        return self._ask(lambda senses: LATE if stopped() else self._play())
+        return self._ask(lambda senses: LATE if stopped() else self._play(senses))
 
     @property
     def state(self) -> AgentState:
@@ -172,8 +173,9 @@ class Motion(Loop):
         if trip is not None:
             self._trip(trip, senses)
             return
-        assert self._activity is not None
-        target, after = self._activity.step(senses)
+        doing = self._activity
+        assert doing is not None
+        target, after = doing.step(senses)
         applied = self._body.command(target, senses.time)
         if isinstance(applied, Trip):
             self._trip(applied, senses)
@@ -182,6 +184,10 @@ class Motion(Loop):
         if isinstance(after, Walk | Play):
             after.keep(senses, applied)
         self._become(after)
+        if isinstance(after, Lie) and not isinstance(doing, Lie):
+            self._body.make_safe(Response.SOFT, senses, senses.time)
+            if not self._body.torque:
+                self._disable(senses)
 
     def _become(self, activity: Activity) -> None:
         now, before = (isinstance(a, Walk | Play) for a in (activity, self._activity))
@@ -282,9 +288,11 @@ class Motion(Loop):
         self._become(along((begin, *script.way), ramp, Play(script, ramp, self._happened)))
         return None
 
-    def _play(self) -> Refused | None:
+    def _play(self, senses: Senses) -> Refused | None:
         if not isinstance(self._activity, Play) or self._activity.go:
             return Refused("no script waits in its first pose")
+        if self._activity.script.support == "ground" and fallen(senses):
+            return Refused("the robot lies; put it on its feet")
         self._activity.go = True
         return None
 

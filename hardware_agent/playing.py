@@ -40,24 +40,27 @@ def play(socket: Path, files: Sequence[Path], repeats: int, auto: bool) -> int:
     """
     if not auto and not sys.stdin.isatty():
         raise InputError("this is no terminal; --auto plays without questions")
-    wanted = [(file.absolute(), Script.read(file)) for file in files for _ in range(repeats)]
+    scripts = [Script.read(file) for file in files]
     with _stopping(socket), nullcontext() if auto else keys():
         if not auto:
             print(HELP, flush=True)
         try:
-            for file, script in wanted:
-                _one(socket, file, script, auto)
+            for script in scripts:
+                first: str | None = None
+                for _ in range(repeats):
+                    first = _one(socket, script, first, auto) or first
         except _Ended as error:
             print(error, file=sys.stderr)
             return 1
     return 0
 
 
-def _one(socket: Path, file: Path, script: Script, auto: bool) -> None:
+def _one(socket: Path, script: Script, repeat_of: str | None, auto: bool) -> str | None:
+    """Play a script; the recording's id, None where it was skipped."""
     print(f"{script.id}: {script.motion}, {script.support}, {script.duration:.1f} s", flush=True)
     if not auto and not _agreed(socket, moved=False):
-        return
-    say(socket, {"do": "pose", "script": str(file)})
+        return None
+    say(socket, {"do": "pose", "script": script.document(), "repeat_of": repeat_of})
     told = _until(socket, ("ready", ""), auto)
     if told["stage"] == "ready":
         if not auto and script.support == "ground":
@@ -69,6 +72,7 @@ def _one(socket: Path, file: Path, script: Script, auto: bool) -> None:
     if "recording" not in result:
         raise _Ended(f"{script.id}: {result.get('reason', 'it ended')}")
     print(result["recording"], flush=True)
+    return Path(result["recording"]).stem
 
 
 def _agreed(socket: Path, moved: bool) -> bool:

@@ -1,5 +1,6 @@
 """Scripts that whoever stands at the robot lets it play, and their recordings."""
 
+import itertools
 import logging
 from collections.abc import Callable
 from enum import StrEnum
@@ -18,6 +19,9 @@ from pup.robot import RobotDescription
 from pup.script import Script
 
 log = logging.getLogger("pup-agent")
+
+SLACK = 0.02
+"""Rad (m) beyond a joint's range that a script may ask for; the limits hold it back there."""
 
 
 class Stage(StrEnum):
@@ -44,6 +48,7 @@ class Scripts:
         self._folder, self._source = folder, source
         self._script: Script | None = None
         self._stage = Stage.NONE
+        self._repeat_of: str | None = None
         self._result: dict[str, str] = {}
 
     @property
@@ -52,25 +57,38 @@ class Scripts:
         name = None if self._script is None else self._script.name
         return {"name": name, "stage": str(self._stage), "result": self._result}
 
-    def pose(self, file: object, stopped: Callable[[], bool]) -> None:
+    def pose(self, told: object, repeat_of: object, stopped: Callable[[], bool]) -> None:
         """Let the robot go to a script's first pose.
 
         Args:
-          file: the script's.
+          told: the script, as JSON values.
+          repeat_of: id of the recording that this one shall repeat, None for the first.
           stopped: whether somebody has stopped the robot since this was asked for.
 
         Raises:
           InputError: it is no script of this robot, or cannot be played now.
         """
-        if not isinstance(file, str):
-            raise InputError("'script' is no path of a file")
-        script = Script.read(Path(file))
-        if script.robot != self._robot.name or script.joints != self._robot.joint_names:
-            raise InputError(f"{file}: is for {script.robot!r}, or for other joints than here")
+        script = Script.of(told)
+        self._check(script)
+        first = script.name if repeat_of is None else repeat_of
+        if not isinstance(first, str) or not first.startswith(script.name):
+            raise InputError(f"{repeat_of!r} is no recording of {script.name}")
+        self._repeat_of = None if repeat_of is None else first
         refused = self._motion.pose(script, stopped)
         if refused is not None:
             raise InputError(refused.reason)
         self._script, self._stage, self._result = script, Stage.POSING, {}
+
+    def _check(self, script: Script) -> None:
+        robot = self._robot
+        if script.robot != robot.name or script.joints != robot.joint_names:
+            raise InputError(f"{script.id}: is for {script.robot!r}, or for other joints than here")
+        poses = np.concatenate([script.way, script.target, script.back])
+        lower, upper = (np.array([getattr(j, k) for j in robot.joints]) for k in ("lower", "upper"))
+        beyond = ((poses < lower - SLACK) | (poses > upper + SLACK)).any(axis=0)
+        if beyond.any():
+            joint = script.joints[int(np.argmax(beyond))]
+            raise InputError(f"{script.id}: moves {joint} beyond its range; are these radians?")
 
     def play(self, stopped: Callable[[], bool]) -> None:
         """Play it.
@@ -93,27 +111,27 @@ class Scripts:
         log.info("script %s: %s", event.script.name, ", ".join(self._result.values()))
 
     def _keep(self, event: Played) -> dict[str, str]:
-        """Write the recording; a script that is played again repeats its first."""
+        """Write the recording; names go on where the script was recorded before."""
         script, rows = event.script, np.array([row.values for row in event.rows])
-        names = [script.name, *(f"{script.name}_again_{n}" for n in range(1, 1000))]
-        free = next((n for n in names if not self._file(n).exists()), None)
-        if free is None:
-            return {"reason": "recorded a thousand times already; move the recordings away"}
+        if len(rows) < 2:
+            return {"reason": "it was over before it began"}
+        names = itertools.chain([script.name], (f"{script.name}_{n}" for n in itertools.count(2)))
+        name = next(name for name in names if not self._file(name).exists())
         try:
             made = Recording(
-                id=free,
+                id=name,
                 robot=script.robot,
                 motion=script.motion,
                 support=script.support,
                 source=self._source,
                 **columns_of(rows, script.joints),
-                repeat_of=None if free == script.name else script.name,
+                repeat_of=self._repeat_of,
                 notes="played by pup-agent",
             )
-            made.write(self._file(free))
+            made.write(self._file(name))
         except (OSError, InputError) as error:
             return {"reason": f"the recording is lost: {brief(str(error))}"}
-        return {"recording": str(self._file(free))}
+        return {"recording": str(self._file(name))}
 
     def _file(self, name: str) -> Path:
         return self._folder / f"{name}.parquet"

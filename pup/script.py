@@ -7,6 +7,7 @@ needs no simulator for it.
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,11 @@ from pup.recording_rules import SUPPORTS, check_id
 Array = NDArray[np.float64]
 
 SCHEMA = 1
-LIMIT = 2**23  # bytes of a file
-LONGEST = 600.0  # s
+LIMIT = 2**19  # bytes; an agent reads it while it holds a robot
+LONGEST = 60.0  # s
 POSES = 16  # on the way, at most
+DIGITS = 6  # after the point, of rad and s
+NAME = 80  # characters of an id, to which the digest and a number are added
 SHOWN = 8
 """Digits of its digest that tell a script from another of the same name."""
 
@@ -64,7 +67,7 @@ class Script:
         """Whether the robot lies at the end."""
         return not len(self.back)
 
-    @property
+    @cached_property
     def name(self) -> str:
         """Its id and the beginning of its digest: what is recorded of it is called so."""
         told = json.dumps(self.document(), sort_keys=True).encode()
@@ -76,10 +79,10 @@ class Script:
         return np.asarray(self.target[max(row, 0)])
 
     def document(self) -> dict[str, Any]:
-        """As JSON values."""
+        """As JSON values, rounded."""
         told: dict[str, Any] = {"schema": SCHEMA, "id": self.id, "robot": self.robot}
         told |= {"motion": self.motion, "support": self.support, "joints": list(self.joints)}
-        return told | {name: getattr(self, name).tolist() for name in NUMBERS}
+        return told | {name: getattr(self, name).round(DIGITS).tolist() for name in NUMBERS}
 
     def write(self, file: Path) -> None:
         """Write it."""
@@ -94,9 +97,18 @@ class Script:
         """
         told = read_json(file, LIMIT)
         try:
-            return _checked(told)
+            return cls.of(told)
         except InputError as error:
             raise InputError(f"{file}: {error}; `pup record --scripts` makes scripts") from error
+
+    @classmethod
+    def of(cls, told: object) -> "Script":
+        """What JSON values say.
+
+        Raises:
+          InputError: as `read`.
+        """
+        return _checked(told)
 
 
 NUMBERS = ("way", "time", "target", "back")
@@ -109,6 +121,8 @@ def _checked(told: object) -> Script:
         if not isinstance(told.get(key), str) or not told[key]:
             raise InputError(f"{key!r} is {told.get(key)!r}; it must be a text")
     check_id(told["id"])
+    if len(told["id"]) > NAME:
+        raise InputError(f"'id' has {len(told['id'])} characters; {NAME} are the most")
     if told.get("support") not in SUPPORTS:
         raise InputError(f"'support' is {told.get('support')!r}; use {', '.join(SUPPORTS)}")
     joints = told.get("joints")

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 from pup.errors import InputError
+from services.failures import FailedError
 
 
 class Pool(Protocol):
@@ -67,12 +68,15 @@ def _shared_out(options: argparse.Namespace) -> int:
 
     Raises:
       InputError: some runners would wait for ever.
+      FailedError: others have the cores, or nodes are away; there may be room another time.
     """
-    from workers.cluster import cores_free
+    from workers.cluster import cores_free, cores_in_all
 
     if options.cores or not options.runners:
         return cores(options)  # without runners this process does all
     if options.runners > (free := cores_free()):
+        if options.runners < cores_in_all():
+            raise FailedError(f"{free} cores of the cluster are free for {options.runners} runners")
         raise InputError(
             f"--runners {options.runners}, where {free} cores of the cluster are free beside this "
             "process; use fewer, or say by --cores how many there will be on one that grows"

@@ -63,7 +63,7 @@ def test_a_script_is_played_recorded_and_repeated(
         made.side(cmd="reset", hold="rope")
         made.start()
         with pytest.raises(InputError, match="enable it first"):
-            made.say("pose", script=str(file))
+            made.say("pose", script=script.document())
         made.say("enable")
         done = subprocess.run(
             command(made, file, "--auto", "--repeats", 2), capture_output=True, text=True
@@ -73,7 +73,7 @@ def test_a_script_is_played_recorded_and_repeated(
         with pytest.raises(InputError, match="no script waits"):
             made.say("play")
     files = [Path(line) for line in done.stdout.splitlines() if line.endswith(".parquet")]
-    assert [f.stem for f in files] == [script.name, f"{script.name}_again_1"]
+    assert [f.stem for f in files] == [script.name, f"{script.name}_2"]
     first, again = map(Recording.read, files)
     for recording in (first, again):
         assert (recording.motion, recording.support) == ("step", "suspended")
@@ -128,18 +128,26 @@ def test_a_robot_that_falls_as_it_should_yields_and_is_taken_up_again(tmp_path: 
         made.side(cmd="reset", hold="hand")
         made.start()
         made.say("enable")
-        made.say("pose", script=str(fall))
+        made.say("pose", script=Script.read(fall).document())
         wait(lambda: made.health()["script"]["stage"] == "ready", 60, made.log)
         made.side(cmd="release")
         made.say("play")
         wait(lambda: made.health()["script"]["stage"] == "", 120, made.log)
         told = made.health()
-        assert told["state"] == "enabled"
+        assert told["state"] == "enabled" and made.side(cmd="bus")["power"] < 0.5  # it yields
         recording = Recording.read(Path(told["script"]["result"]["recording"]))
         assert recording.support == "ground"
         assert np.nanmax(np.abs(recording.extras["imu/roll"])) > 0.5
+        lying = Script.read(fall)
+        made.say("pose", script=lying.document(), repeat_of=lying.name)
+        wait(lambda: made.health()["script"]["stage"] == "ready", 60, made.log)
+        with pytest.raises(InputError, match="the robot lies"):
+            made.say("play")
+        made.say("stop")
+        made.until("stopped")
         made.side(cmd="reset", hold="rope")
-        made.say("pose", script=str(step))
+        made.say("enable")
+        made.say("pose", script=Script.read(step).document())
         wait(lambda: made.health()["script"]["stage"] == "ready", 60, made.log)
 
 
@@ -149,7 +157,7 @@ def test_a_script_of_another_robot_is_refused(tmp_path: Path) -> None:
     script.write(tmp_path / "leg.json")
     with lab(tmp_path, speed=0.0) as made:
         made.start()
-        for words, told in (
+        for words, expected in (
             ((tmp_path / "leg.json", "--auto"), "is for 'darwin_leg'"),
             ((tmp_path / "none.json", "--auto"), "none.json"),
             ((tmp_path / "state", "--auto"), "no *.json in this folder"),
@@ -160,4 +168,52 @@ def test_a_script_of_another_robot_is_refused(tmp_path: Path) -> None:
                 command(made, *words), capture_output=True, text=True, stdin=subprocess.DEVNULL
             )
             assert done.returncode == 2, done.stderr
-            assert told in done.stderr and len(done.stderr.splitlines()) == 1
+            assert expected in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_robot_that_falls_over_in_a_stand_up_yields_and_nothing_is_recorded(
+    tmp_path: Path,
+) -> None:
+    (standup,) = written(tmp_path, "standup:2")
+    script = Script.read(standup)
+    with lab(tmp_path, speed=0.0) as made:
+        made.side(cmd="reset", hold="hand")
+        made.start()
+        made.say("enable")
+        for falls in (False, True):
+            made.say("pose", script=told(script, falls))
+            wait(lambda: made.health()["script"]["stage"] == "ready", 60, made.log)
+            made.side(cmd="release")
+            made.say("play")
+            wait(lambda: made.health()["script"]["stage"] == "", 120, made.log)
+            result = made.health()["script"]["result"]
+            assert ("recording" in result) != falls, result
+        assert result["reason"].startswith("fall")
+        assert made.health()["state"] == "enabled" and made.side(cmd="bus")["power"] < 0.5
+
+
+def told(script: Script, falls: bool) -> dict[str, object]:
+    """A stand-up, or one that throws the robot over: its ankles bend back on the way."""
+    document = script.document()
+    if falls:
+        ankles = [j for j, name in enumerate(script.joints) if "ank_pitch" in name]
+        for row in document["target"][len(script.time) // 2 :]:
+            for j in ankles:
+                joint = OP2.joints[j]
+                row[j] = joint.lower if script.joints[j].startswith("l") else joint.upper
+    return document
+
+
+def test_a_script_beyond_the_joints_ranges_is_refused(tmp_path: Path) -> None:
+    (file,) = written(tmp_path, "step:0.1")
+    document = Script.read(file).document()
+    document["target"] = (np.degrees(document["target"])).tolist()
+    with lab(tmp_path, speed=0.0) as made:
+        made.side(cmd="reset", hold="rope")
+        made.start()
+        made.say("enable")
+        with pytest.raises(InputError, match="are these radians"):
+            made.say("pose", script=document)
+        with pytest.raises(InputError, match="is no recording of"):
+            made.say("pose", script=Script.read(file).document(), repeat_of="other")

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("fastapi")
 
 from pup.errors import InputError
+from services.failures import FailedError
 from services.gateway.dispatcher import Dispatcher
 from services.gateway.job_routes import document
 from services.gateway.jobs import Job, JobState, Seen, Status
@@ -30,6 +31,7 @@ class Ray:
 
     def __init__(self) -> None:
         self.asked: list[str] = []
+        self.full = set[str]()  # submissions that Ray has given up
 
     async def check(self) -> None:
         """It is there."""
@@ -38,6 +40,8 @@ class Ray:
         self.asked.append(submission)
 
     async def seen(self, submission: str) -> Seen:
+        if submission in self.full:
+            return Seen(Status.FAILED, unstarted=True)
         return Seen(Status.PENDING if submission in self.asked else Status.UNKNOWN)
 
 
@@ -69,6 +73,22 @@ def test_jobs_wait_for_those_before_them(store: Store, tmp_path: Path) -> None:
             jobs.folder(name).write_outcome(Outcome(1, 0))
             await jobs.tick()
             assert jobs.job(name).state is JobState.SUCCEEDED
+
+    asyncio.run(told())
+
+
+def test_a_job_that_found_no_room_goes_behind_the_others(store: Store, tmp_path: Path) -> None:
+    async def told() -> None:
+        ray = Ray()
+        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)  # type: ignore[arg-type]
+        large, small = [(await jobs.submit(job(), None))[0].id for _ in range(2)]
+        await jobs.tick()
+        assert ray.asked == [f"{large}-1"]
+        ray.full.add(f"{large}-1")
+        for _ in range(3):
+            await jobs.tick()
+        assert ray.asked == [f"{large}-1", f"{small}-1"]
+        assert jobs.job(large).state is JobState.QUEUED
 
     asyncio.run(told())
 
@@ -121,6 +141,10 @@ def test_runners_share_what_is_free_beside_the_process() -> None:
             assert cores == 2
         refused = pytest.raises(InputError, match="2 cores of the cluster are free")
         with refused, training(options(3)):
+            pass
+        other = Process.remote()
+        ray.get(other.ready.remote())
+        with pytest.raises(FailedError, match="1 cores"), training(options(2)):
             pass
 
 

@@ -66,7 +66,8 @@ WRONG: dict[str, tuple[object, str]] = {
     "joints by number": (small(joints=[1, 2]), "'joints'"),
     "times that do not begin at 0": (small(time=[1, 2]), "'time'"),
     "times that stand still": (small(time=[0, 0]), "'time'"),
-    "an hour": (small(time=[0, 3600]), "600 s at most"),
+    "an hour": (small(time=[0, 3600]), "60 s at most"),
+    "a long name": (small(id="a" * 81), "80 are the most"),
     "no target for a tick": (small(target=[[0, 0]]), "as many rows"),
     "a target that is no number": (small(target=[[0, 0], [0, "x"]]), "'target' holds no rows"),
     "a target that is infinite": (small(target=[[0, 0], [0, float("inf")]]), "finite"),
@@ -104,6 +105,7 @@ def test_ways_lead_from_home_to_the_first_target_and_back(robot: RobotDescriptio
     clearance = Clearance(robot)
     for one, motion in zip(made, plain, strict=True):
         np.testing.assert_array_equal(one.target, motion.target)
+        assert len(json.dumps(one.document())) < LIMIT
         np.testing.assert_array_equal(one.way[-1], motion.target[0])
         np.testing.assert_array_equal(one.way[0], made[0].way[0])
         assert one.falls == (motion.motion == "fall")

@@ -118,10 +118,12 @@ class Dispatcher:
         """Queued jobs whose turn it is, the first ones that came.
 
         A job's process holds its cores while its tasks wait for some: too many would wait for ever.
+        One that found no room goes behind the others, who may find some.
         """
         now = time.time()
-        queued = [j.id for j in self.jobs.values() if j.state is JobState.QUEUED and j.due <= now]
-        return set(queued[: max(0, self.at_once - self._under_way())])
+        queued = [j for j in self.jobs.values() if j.state is JobState.QUEUED and j.due <= now]
+        queued.sort(key=lambda job: job.roomless)
+        return {job.id for job in queued[: max(0, self.at_once - self._under_way())]}
 
     def _under_way(self) -> int:
         return sum(j.open and j.state is not JobState.QUEUED for j in self.jobs.values())

@@ -145,6 +145,13 @@ class Job:
             return 0.0
         return self.last.ended + min(BACKOFF * 2 ** (self.failures - 1), LONGEST)
 
+    @property
+    def roomless(self) -> float:
+        """When its last attempt ended without having found room, s; 0 where it did."""
+        if not self.attempts or self.last.started is not None:
+            return 0.0
+        return self.last.ended or 0.0
+
     def attempted(self, now: float) -> "Job":
         """With another attempt."""
         attempt = Attempt(len(self.attempts) + 1, now)
