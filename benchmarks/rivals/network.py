@@ -25,7 +25,7 @@ from pup.diagnosis.residuals import LOST
 from pup.diagnosis.starts import ROUGHLY
 from pup.files import write_atomic
 from pup.physics.terms import BEYOND, Place, column
-from pup.physics.terms.base import Flow, Quantity, Term
+from pup.physics.terms.base import Flow, Outcome, Quantity, Term
 
 Array = NDArray[np.float64]
 
@@ -91,9 +91,9 @@ class ResidualTorque(Term):
         """See Term."""
         self._error = np.zeros_like(self.scene.inertia)
 
-    def settle(self, error: Array, torque: Array) -> None:
+    def settle(self, outcome: Outcome) -> None:
         """See Term."""
-        self._error[: len(error)] = error
+        self._error[: len(outcome.error)] = outcome.error
 
     def flow(self, flow: Flow) -> None:
         """See Term."""
