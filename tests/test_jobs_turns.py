@@ -54,13 +54,13 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def job(**more: float) -> Job:
-    return Job("", "presysid", FIT, "ann", 0.0, **more)  # type: ignore[arg-type]
+    return Job("", "presysid", FIT, "ann", 0.0, **more)
 
 
 def test_jobs_wait_for_those_before_them(store: Store, tmp_path: Path) -> None:
     async def told() -> None:
         ray = Ray()
-        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)  # type: ignore[arg-type]
+        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)
         names = [(await jobs.submit(job(), None))[0].id for _ in range(3)]
         for number, name in enumerate(names):
             for _ in range(2):
@@ -80,7 +80,7 @@ def test_jobs_wait_for_those_before_them(store: Store, tmp_path: Path) -> None:
 def test_a_job_that_found_no_room_goes_behind_the_others(store: Store, tmp_path: Path) -> None:
     async def told() -> None:
         ray = Ray()
-        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)  # type: ignore[arg-type]
+        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)
         large, small = [(await jobs.submit(job(), None))[0].id for _ in range(2)]
         await jobs.tick()
         assert ray.asked == [f"{large}-1"]
@@ -95,7 +95,7 @@ def test_a_job_that_found_no_room_goes_behind_the_others(store: Store, tmp_path:
 
 def test_what_never_finds_room_is_refused(store: Store, tmp_path: Path) -> None:
     async def told(cores: int, **more: float) -> None:
-        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None, 1, cores)  # type: ignore[arg-type]
+        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None, 1, cores)
         await jobs.submit(job(**more), None)
 
     asyncio.run(told(2))
@@ -150,7 +150,7 @@ def test_runners_share_what_is_free_beside_the_process() -> None:
 
 def test_storage_that_hangs_takes_no_threads_of_others(store: Store, tmp_path: Path) -> None:
     async def told() -> None:
-        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None)  # type: ignore[arg-type]
+        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None)
         made, _ = await jobs.submit(job(), None)
         log = jobs.folder(made.id).log
         os.mkfifo(log)  # who opens it waits, as on a mount whose server is gone
