@@ -12,7 +12,7 @@ from hardware_agent.config import ControlSettings
 from hardware_agent.limits import Applied
 from hardware_agent.rollout import Rollout, Row
 from hardware_agent.senses import Senses
-from pup.script import Script
+from pup.script import FALLEN, Script
 from pup.wire import AgentState, Assign, Outcome
 
 Array = NDArray[np.float64]
@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 RETURN = 0.5  # s from where a walk's end left the joints to the pose that stands
 WATCHED = 2.0  # s after that in which it may still fall; then people take it
 REST = 1.5  # s in a script's first pose before it begins
-FALLEN = 1.0  # rad of roll or pitch; the authors switch their robot off there, and a fall ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,16 +312,13 @@ class Play:
     def _return(self, senses: Senses) -> tuple[Array, Activity]:
         """Home; the script is over when the robot is there."""
         if self.home is None:
-            self.home = along((self.script.target[-1], *self.script.back), self.ramp)
-        after: Activity = Lie()
-        target = senses.goal
-        if not self.script.falls:
-            target, after = self.home.step(senses)
-        if isinstance(after, Hold | Lie):
-            self.emit(Played(self.script, self.rows))
-            return target, after
-        self.home = after
-        return target, self
+            way = (self.script.target[-1], *self.script.back)
+            self.home = Lie() if self.script.falls else along(way, self.ramp)
+        target, self.home = self.home.step(senses)
+        if isinstance(self.home, Ramp):
+            return target, self
+        self.emit(Played(self.script, self.rows))
+        return target, self.home
 
     def _lies(self, senses: Senses) -> bool:
         return self.script.falls and fallen(senses)

@@ -45,9 +45,7 @@ class Body:
         self.imu = imu_of(settings.imu)
         self.bus = Bus(settings.bus, self.ids, senses=settings.imu.kind == "cm740")
         self.guard = Guard(settings.safety, robot.gait.tilt_limit if robot.gait else TILT)
-        lower = np.array([joint.lower for joint in robot.joints])
-        upper = np.array([joint.upper for joint in robot.joints])
-        self.limiter = Limiter(self.names, lower, upper, settings.safety)
+        self.limiter = Limiter(self.names, *robot.limits, settings.safety)
         self.torque = self.ready = False
         self.repeated = self.lost = 0
         self._forget()

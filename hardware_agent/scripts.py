@@ -84,7 +84,7 @@ class Scripts:
         if script.robot != robot.name or script.joints != robot.joint_names:
             raise InputError(f"{script.id}: is for {script.robot!r}, or for other joints than here")
         poses = np.concatenate([script.way, script.target, script.back])
-        lower, upper = (np.array([getattr(j, k) for j in robot.joints]) for k in ("lower", "upper"))
+        lower, upper = robot.limits
         beyond = ((poses < lower - SLACK) | (poses > upper + SLACK)).any(axis=0)
         if beyond.any():
             joint = script.joints[int(np.argmax(beyond))]

@@ -153,6 +153,12 @@ class RobotDescription:
         return tuple(joint.name for joint in self.joints)
 
     @property
+    def limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest angles of the joints, each (n_joints,), rad (m for a slide)."""
+        lower = np.array([joint.lower for joint in self.joints])
+        return lower, np.array([joint.upper for joint in self.joints])
+
+    @property
     def group_index(self) -> NDArray[np.intp]:
         """Position in `groups` of each joint's group, shape (n_joints,)."""
         return np.array([self.groups.index(joint.group) for joint in self.joints], dtype=np.intp)

@@ -24,6 +24,8 @@ SCHEMA = 1
 LIMIT = 2**19  # bytes; an agent reads it while it holds a robot
 LONGEST = 60.0  # s
 POSES = 16  # on the way, at most
+FALLEN = 1.0
+"""Rad of roll or pitch; there the authors switch their robot off, and a fall ends."""
 DIGITS = 6  # after the point, of rad and s
 NAME = 80  # characters of an id, to which the digest and a number are added
 SHOWN = 8

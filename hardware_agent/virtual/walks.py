@@ -47,8 +47,7 @@ def walk(
     card, gait, robot = policy.card, policy.card.gait, fleet.robot
     assert robot.gait is not None
     seen = columns(card.joints, card.observation)
-    lower = np.array([joint.lower for joint in robot.joints])
-    upper = np.array([joint.upper for joint in robot.joints])
+    lower, upper = robot.limits
     reach, tilted = SafetySettings.speed * period, SafetySettings.fall_tilt or robot.gait.tilt_limit
     axis = np.array(AXES[card.direction])
 

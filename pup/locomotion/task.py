@@ -162,8 +162,7 @@ class WalkingTask:
         self.joints = robot.joint_names
         self.parameter_names = sampler.names
         self.reference = Reference(self.gait)
-        self.lower = np.array([joint.lower for joint in robot.joints])
-        self.upper = np.array([joint.upper for joint in robot.joints])
+        self.lower, self.upper = robot.limits
         self._axis = np.array(settings.direction.axis)
         self._across = np.array([-self._axis[1], self._axis[0]])
         self._starts = Starts(robot, self.reference.start, settings, n)

@@ -139,7 +139,7 @@ def joint_units(robot: RobotDescription) -> Array:
     Shape (n_joints,).
     """
     model = compile_model(robot, "suspended" if robot.floating else "bench").compiled
-    lower, upper = _limits(robot)
+    lower, upper = robot.limits
     slides = [
         model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in robot.joint_names
     ]
@@ -187,18 +187,13 @@ def _ticks(end: float, rng: np.random.Generator | None) -> Array:
     return time[time <= end]
 
 
-def _limits(robot: RobotDescription) -> tuple[Array, Array]:
-    lower = np.array([joint.lower for joint in robot.joints])
-    return lower, np.array([joint.upper for joint in robot.joints])
-
-
 class _Room:
     """Where a robot's joints may go without touching each other, and random places in it."""
 
     def __init__(self, robot: RobotDescription, rng: np.random.Generator) -> None:
         self.name = robot.name
         self.rng = rng
-        self.lower, self.upper = _limits(robot)
+        self.lower, self.upper = robot.limits
         self.unit = joint_units(robot)
         self.clearance = Clearance(robot, ROOM)
 

@@ -64,9 +64,7 @@ def falling_pose(robot: RobotDescription, direction: str) -> Array:
                 f"robot {robot.name!r} has a leg without a lateral axis; it cannot fall {direction}"
             )
         turn[leg[usable[0]]] = way * np.sign(lateral[usable[0]]) * LEAN
-    lower = np.array([joint.lower for joint in robot.joints])
-    upper = np.array([joint.upper for joint in robot.joints])
-    return np.clip(stand + turn, lower, upper)
+    return np.clip(stand + turn, *robot.limits)
 
 
 def _standing(robot: RobotDescription, stand: Array) -> tuple[mujoco.MjModel, mujoco.MjData]:

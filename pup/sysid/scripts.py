@@ -51,5 +51,4 @@ def _whole(robot: RobotDescription, clearance: Clearance, home: Array, made: Mot
 
 def _home(robot: RobotDescription) -> Array:
     named = [robot.poses[name] for name in HOME if name in robot.poses]
-    lower, upper = (np.array([getattr(j, k) for j in robot.joints]) for k in ("lower", "upper"))
-    return np.asarray(named[0] if named else np.clip(0.0, lower, upper), dtype=np.float64)
+    return np.asarray(named[0] if named else np.clip(0.0, *robot.limits), dtype=np.float64)

@@ -19,13 +19,13 @@ from pup.physics.simulator import Trajectories
 from pup.physics.terms import split_column
 from pup.recording import Recording, write_recordings
 from pup.robot import RobotDescription
+from pup.script import FALLEN
 from pup.sysid.excitation import Motion, joint_units, script
 from pup.sysid.result import read_fitted
 
 Array = NDArray[np.float64]
 
 SETTLING = 2.0  # s in the first pose before the recording begins, to sag and to come to rest
-FALLEN = 1.0  # rad of roll or pitch; there the authors switch their robot off, and a fall ends
 
 GAIN_SPREAD = (0.7, 1.4)  # times nominal, of everything that scales a servo
 GAINS = ("rho", "sigma", "kp", "kd", "tau_max")

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hardware_agent.activities import REST, fallen
 from hardware_agent.body import Body
 from hardware_agent.config import (
     BusSettings,
@@ -50,12 +51,8 @@ PERIOD = 0.03
 """Between two ticks on the way to a script's first pose, s."""
 WAY = 2.0
 """From one pose to the next on that way, s."""
-REST = 1.5
-"""In the first pose before the script begins, s."""
 STEADY = 0.3
 """In the pose that it was put down in, until it is let go, s."""
-FALLEN = 1.0
-"""Rad of roll or pitch; there the authors switch their robot off, and a fall ends."""
 PATIENCE = 120.0
 """For the robot's ports to be there, s; the machine may be busy."""
 
@@ -190,7 +187,7 @@ class Player:
         for target, gap in zip(motion.target, gaps, strict=True):
             row = self._tick(target, float(gap), name)
             rows.append(Row(round(row.time - begin, 6), row.senses, row.applied))
-            if motion.motion == "fall" and _tilted(row):
+            if motion.motion == "fall" and fallen(row.senses):
                 break
         return rows
 
@@ -220,11 +217,6 @@ class Player:
 
     def _say(self, **command: Any) -> None:
         say(self.doors.side, command)
-
-
-def _tilted(row: Row) -> bool:
-    imu = row.senses.imu
-    return imu is not None and max(abs(imu.roll), abs(imu.pitch)) > FALLEN
 
 
 def _settings(robot: RobotDescription, doors: Doors) -> Settings:
