@@ -12,8 +12,9 @@ from pup.physics.actuators import PD, NetworkPD
 from pup.physics.brax_engine import Bodies, Fields, System, fields_of, jax, jnp, move, put_system
 from pup.physics.brax_servos import Last, Law, Servos, law_of
 from pup.physics.commands import Commands
+from pup.physics.groups import Group
 from pup.physics.model import Model
-from pup.physics.mujoco_batch import Group, MujocoSimulator, Run
+from pup.physics.mujoco_batch import MujocoSimulator, Run
 from pup.physics.parameters import Candidates
 from pup.physics.push import Push
 from pup.physics.simulator import Trajectories

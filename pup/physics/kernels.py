@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
+Ids = NDArray[np.int32]
 P = ParamSpec("P")
 
 _TYPES = {
     Array: numba.float64[:, :],
     Mask: numba.boolean[:, :],
     Index: numba.int64[:, :],
+    Ids: numba.int32[:],
     float: numba.float64,
 }
 """Strides of any kind, so that a function is compiled once whatever arrays are views of."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import pairwise
 
 import mujoco
@@ -12,17 +11,17 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.physics.actuators import LAWS, TorqueLaw
-from pup.physics.commands import Commands
 from pup.physics.encoders import Event, History
 from pup.physics.fields import scaled
-from pup.physics.model import Model, compile_model, first_tilt, mount, standing_qpos
+from pup.physics.groups import Group, group_of
+from pup.physics.model import mount, standing_qpos
+from pup.physics.one_joint import OneJoint
 from pup.physics.outfit import as_the_imu_tells, fit_out, longest
 from pup.physics.parameters import Candidates
 from pup.physics.push import Push, Pushing
-from pup.physics.rest import ticks_at_rest
 from pup.physics.rotations import multiply, roll_pitch
 from pup.physics.servo import Servos
-from pup.physics.simulator import Schedule, Trajectories, schedule, tick_slices
+from pup.physics.simulator import Trajectories, tick_slices
 from pup.physics.terms import Drivetrain
 from pup.physics.writer import FieldWriter
 from pup.recording import Recording
@@ -35,37 +34,6 @@ SIMULATIONS = 512
 
 _BROKEN = slice(mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC + 1)
 """Warnings of broken positions, velocities and accelerations."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Recordings of one support, longest first, so that those still running are the first ones.
-
-    Attributes:
-      members: which recordings.
-      model: the compiled model.
-      setups: the setup knobs of each recording.
-      start: starting qpos of each, shape (n_recordings, nq).
-      torso: first orientations by the IMU, shape (n_recordings, 4); NaN where there is none.
-      start_velocity: starting joint velocities, shape (n_recordings, n_joints).
-      commands: their targets.
-      power: share of torque on, shape (n_steps, n_recordings).
-      running: how many recordings still run in each sub-step.
-      events: the ticks in each sub-step.
-      rests: which recordings begin at rest on the ground, shape (n_recordings,).
-    """
-
-    members: tuple[int, ...]
-    model: Model
-    setups: tuple[dict[str, float], ...]
-    start: Array
-    torso: Array
-    start_velocity: Array
-    commands: Commands
-    power: Array
-    running: NDArray[np.int64]
-    events: tuple[Event | None, ...]
-    rests: NDArray[np.bool_]
 
 
 class MujocoSimulator:
@@ -104,7 +72,9 @@ class MujocoSimulator:
         self.lead = lead
         self.ticks = tick_slices(self.recordings)
         supports = sorted({r.support for r in self.recordings})
-        self.groups = tuple(self._group(support) for support in supports)
+        self.groups = tuple(
+            group_of(robot, self.recordings, support, self.ticks) for support in supports
+        )
 
     @property
     def steps(self) -> int:
@@ -145,58 +115,6 @@ class MujocoSimulator:
         parts = min(candidates, each * self.threads)
         edges = np.linspace(0, candidates, parts + 1).astype(int)
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
-
-    def _group(self, support: str) -> Group:
-        members = [i for i, r in enumerate(self.recordings) if r.support == support]
-        model = compile_model(self.robot, support)
-        plans = {
-            i: schedule(self.recordings[i], self.robot.joint_names, self.robot.timestep)
-            for i in members
-        }
-        members.sort(key=lambda i: -plans[i].steps)
-        ordered = [plans[i] for i in members]
-        steps = ordered[0].steps
-        power = np.stack([_extended(p.power, steps) for p in ordered], axis=1)
-        torso = [first_tilt(self.robot, model, self.recordings[i]) for i in members]
-        start = [
-            standing_qpos(self.robot, model, plans[i].start, tilt)
-            for i, tilt in zip(members, torso, strict=True)
-        ]
-        return Group(
-            members=tuple(members),
-            model=model,
-            setups=tuple(self.robot.setup(self.recordings[i].setup) for i in members),
-            start=np.stack(start),
-            torso=np.stack(torso),
-            start_velocity=np.stack([p.start_velocity for p in ordered]),
-            commands=Commands(ordered, self.robot.timestep),
-            power=np.ascontiguousarray(power),
-            running=np.sum([np.arange(steps) < p.steps for p in ordered], axis=0),
-            events=_events(ordered, [self.ticks[i].start for i in members], steps),
-            rests=np.array([ticks_at_rest(self.recordings[i]) > 1 for i in members]),
-        )
-
-
-def _extended(values: Array, steps: int) -> Array:
-    """Repeat the last row up to a number of sub-steps."""
-    return np.concatenate([values, np.repeat(values[-1:], steps - len(values), axis=0)])
-
-
-def _events(
-    plans: Sequence[Schedule], first_tick: Sequence[int], steps: int
-) -> tuple[Event | None, ...]:
-    rows = np.concatenate([np.full(len(p.tick_step), i) for i, p in enumerate(plans)])
-    ticks = np.concatenate(
-        [f + np.arange(len(p.tick_step)) for f, p in zip(first_tick, plans, strict=True)]
-    )
-    step = np.concatenate([p.tick_step for p in plans])
-    fraction = np.concatenate([p.tick_fraction for p in plans])
-    order = np.argsort(step, kind="stable")
-    edges = np.searchsorted(step[order], np.arange(steps + 1))
-    return tuple(
-        Event(rows[order[a:b]], ticks[order[a:b]], fraction[order[a:b]]) if b > a else None
-        for a, b in pairwise(edges)
-    )
 
 
 class Run:
@@ -253,6 +171,7 @@ class Run:
             wrenches = self.batch.bind("xfrc_applied")
             for term in pushing:
                 term.push(wrenches)
+        self.engine = OneJoint.of(self.batch) or self.batch
         self.acceleration = self.batch.bind("qacc")
         self.bias = self.batch.bind("qfrc_bias")
         sensed = self._begun(nsim)
@@ -386,7 +305,7 @@ class Run:
 
     def _advance(self, ids: NDArray[np.int32] | None) -> None:
         try:
-            self.batch.step(ids=ids)
+            self.engine.step(ids=ids)
         except mujoco.batch.SimulationError as error:
             self.broken[error.ids] = True
             self.batch.reset(ids=error.ids)
