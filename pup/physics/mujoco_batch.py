@@ -256,6 +256,9 @@ class Run:
         read = np.hstack([position, torso])
         for term in reversed(self.terms):
             term.start(position, torso)
+        if not model.floating:
+            qpos[:, model.qpos] = position
+            return qpos
         was = np.hstack([position, torso])
         for row in np.flatnonzero(((was != read) & ~np.isnan(was)).any(axis=1)):
             qpos[row] = standing_qpos(self.robot, model, position[row], torso[row])

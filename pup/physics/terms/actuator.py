@@ -137,6 +137,8 @@ class ThermalDrift(Term):
     def prepare(self) -> None:
         """See Term."""
         self._warmth = np.zeros_like(self.values["rate"])
+        self._heat = self.values["load"] / self.scene.limit
+        self._cooling = self.scene.timestep / self.values["time"]
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
@@ -150,11 +152,10 @@ class ThermalDrift(Term):
     def settle(self, outcome: Outcome) -> None:
         """See Term: nothing warms before the recording begins."""
         n = len(outcome.torque)
-        load = self.values["load"][:n]
-        gained = 1 - load + load * np.abs(outcome.torque) / self.scene.limit[:n]
+        gained = 1 - self.values["load"][:n] + self._heat[:n] * np.abs(outcome.torque)
         gained *= outcome.time >= 0
-        lost = self._warmth[:n] / self.values["time"][:n]
-        self._warmth[:n] += self.scene.timestep * (gained - lost)
+        warmth = self._warmth[:n]
+        warmth += self.scene.timestep * gained - self._cooling[:n] * warmth
 
 
 class GainAsymmetry(Term):
@@ -194,6 +195,8 @@ class IntegralAction(Term):
     def prepare(self) -> None:
         """See Term."""
         self._sum = np.zeros_like(self.values["gain"])
+        self._most = self.values["share"] * self.scene.limit / np.maximum(self.values["gain"], 1e-9)
+        self._least = -self._most
 
     def held(self, load: Array, gravity: Array) -> Array:
         """See Term: a controller that has held a load for long starts with it in its integral.
@@ -218,9 +221,8 @@ class IntegralAction(Term):
     def _after(self, time: float | Array, error: Array) -> Array:
         """What an error makes of the integral in some time, rad s."""
         n = len(error)
-        most = self.scene.limit[:n] / np.maximum(self.values["gain"][:n], 1e-9)
-        most *= self.values["share"][:n]
-        return np.clip(self._sum[:n] + time * error, -most, most)
+        after = self._sum[:n] + time * error
+        return np.maximum(np.minimum(after, self._most[:n]), self._least[:n])
 
 
 class DerivativeKick(Term):
@@ -242,14 +244,15 @@ class DerivativeKick(Term):
         """See Term."""
         self._goal = np.full_like(self.values["gain"], np.nan)
         self._rate = np.zeros_like(self._goal)
+        self._pace = -self.scene.timestep / np.maximum(self.values["time"], 1e-9)
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term: commands stay as they are, their filtered rate is taken note of."""
         n = len(now)
-        goal, lag = self._goal[:n], self.scene.timestep / np.maximum(self.values["time"][:n], 1e-9)
+        goal, pace = self._goal[:n], self._pace[:n]
         begin(goal, before)
-        at_change = before + np.exp(-lag * (1 - share)) * (goal - before)
-        later = now + np.exp(-lag * share) * (at_change - now)
+        at_change = before + np.exp(pace * (1 - share)) * (goal - before)
+        later = now + np.exp(pace * share) * (at_change - now)
         self._rate[:n] = (later - goal) / self.scene.timestep
         goal[:] = later
         return now, before

@@ -263,14 +263,22 @@ class JointStop(Term):
     )
     source = "geometry; stiffness of plastic parts"
 
+    def prepare(self) -> None:
+        """See Term."""
+        stiffness, step = self.values["stiffness"], self.scene.timestep
+        self._side = np.sign(self.values["side"])
+        self._reach, self._past = spring_shares(stiffness, self.scene.inertia, step)
+        # How far ahead of the velocities what presses on it is told.
+        self._soon, self._later = np.ones_like(self._past) * step / 2, self._reach + self._past
+
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n, step = len(flow.torque), self.scene.timestep
-        stiffness, side = self.values["stiffness"][:n], np.sign(self.values["side"][:n])
-        into = side * (flow.position - self.values["angle"][:n])
-        speed = side * flow.velocity
-        reach, past = spring_shares(stiffness, self.scene.inertia[:n], step)
-        pressed = (into + step / 2 * speed > 0) & (into + (reach + past) * speed > 0)
-        stiffness = np.where(pressed, stiffness, 0.0)
-        flow.torque -= side * stiffness * (into + past * speed)
-        flow.damping += stiffness * reach
+        n = len(flow.torque)
+        into = self._side[:n] * (flow.position - self.values["angle"][:n])
+        speed = self._side[:n] * flow.velocity
+        pressed = (into + self._soon[:n] * speed > 0) & (into + self._later[:n] * speed > 0)
+        if not pressed.any():
+            return
+        stiffness = np.where(pressed, self.values["stiffness"][:n], 0.0)
+        flow.torque -= self._side[:n] * stiffness * (into + self._past[:n] * speed)
+        flow.damping += stiffness * self._reach[:n]
