@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.files import MISTAKES
 from pup.recording_rules import check_joints, check_metadata, check_values
 
 Array = NDArray[np.float64]
@@ -95,7 +96,7 @@ def _opened(path: Path) -> Iterator[Any]:
         size = path.stat().st_size
         if not path.is_file():
             raise InputError("not a file")
-    except OSError as error:
+    except MISTAKES as error:
         raise InputError(f"cannot be read ({error.strerror})") from error
     if size > MAX_FILE:
         raise InputError(f"{size} bytes; a recording has at most {MAX_FILE}")

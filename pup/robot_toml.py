@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from pup.errors import InputError
+from pup.files import MISTAKES
 
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
@@ -17,12 +18,13 @@ def read_text(path: Path, limit: int) -> str:
 
     Raises:
       InputError: the file is absent, too large or not UTF-8.
+      OSError: the storage cannot be read now.
     """
     try:
         if path.stat().st_size > limit:
             raise InputError(f"{path}: larger than {limit} bytes; is this the right file?")
         return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
+    except MISTAKES as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from error

@@ -117,8 +117,9 @@ class FirstGait:
         file = self.out / LOSSES
         if not file.exists():
             return np.empty((0, 0)), 0.0
+        content = io.BytesIO(file.read_bytes())
         try:
-            with np.load(file, allow_pickle=False) as packed:
+            with np.load(content, allow_pickle=False) as packed:
                 losses, told = np.array(packed["losses"]), str(packed["identity"])
                 spent = float(packed["seconds"])
         except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:

@@ -11,6 +11,7 @@ from commandline import pup
 
 from pup.errors import InputError
 from pup.files import read_json, write_atomic
+from pup.robot_toml import read_text
 from services.checkpoint import Checkpoint
 
 
@@ -55,6 +56,13 @@ def test_trouble_of_the_storage_is_no_bad_input(no_file: Path) -> None:
         read_json(no_file.with_name("absent"))
     with pytest.raises(OSError, match="No such device"):
         read_json(no_file)
+
+
+def test_nor_is_it_of_a_robot(no_file: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_text(no_file.with_name("absent"), 100)
+    with pytest.raises(OSError, match="No such device"):
+        read_text(no_file, 100)
 
 
 def test_a_checkpoint_that_cannot_be_read_now_is_kept(no_file: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.files import MISTAKES
 
 Array = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ def read_text(path: Path, limit: int = MAX_TEXT) -> str:
         if path.stat().st_size > limit:
             raise InputError(f"larger than {limit} bytes; is this the right file?")
         return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
+    except MISTAKES as error:
         raise InputError(f"cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"not UTF-8 text ({error})") from error

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pup.errors import InputError
+from pup.files import MISTAKES
 from pup.importers.common import MAX_CELLS, Array, ImportOptions, finite
 from pup.recording import Recording, from_columns
 
@@ -70,7 +71,7 @@ def _load(path: Path) -> dict[str, Array]:
         if path.stat().st_size > MAX_FILE:
             raise InputError(f"larger than {MAX_FILE} bytes; is this the right file?")
         content = path.read_bytes()
-    except OSError as error:
+    except MISTAKES as error:
         raise InputError(f"cannot be read ({error.strerror})") from error
     order = {b"IM": "<", b"MI": ">"}.get(content[HEADER - 2 : HEADER])
     if order is None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.files import read_json, write_atomic, write_json
+from pup.files import MISTAKES, read_json, write_atomic, write_json
 from pup.policy.scale import UnitScale
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import Gait, Harmonics, RobotDescription
@@ -163,7 +163,7 @@ def _content(file: Path, digest: str) -> bytes:
         if file.stat().st_size > WEIGHTS_LIMIT:
             raise InputError(f"{file}: larger than {WEIGHTS_LIMIT} bytes; take the bundle anew")
         content = file.read_bytes()
-    except OSError as error:
+    except MISTAKES as error:
         raise InputError(f"{file}: cannot be read ({error.strerror})") from error
     if hashlib.sha256(content).hexdigest() != digest:
         raise InputError(f"{file}: does not match {CARD}; take the bundle anew")

@@ -178,9 +178,11 @@ class CmaFit:
 
         Raises:
           InputError: the file is not a checkpoint of this search.
+          OSError: it cannot be read now.
         """
+        content = io.BytesIO(path.read_bytes())
         try:
-            with np.load(path, allow_pickle=False) as saved:
+            with np.load(content, allow_pickle=False) as saved:
                 identity, losses = str(saved["fit"]), saved["losses"]
                 polished = saved.get("polished")
         except Exception as error:  # NumPy's reader raises what a torn file happens to hit
