@@ -40,7 +40,7 @@ class Trial:
     def __init__(self, policy: NumpyPolicy, robot: RobotDescription, bounds: FittedBounds) -> None:
         self.policy, self.robot, self.bounds = policy, robot, bounds
         direction = Direction(policy.card.direction)
-        self.settings = TaskSettings(direction=direction).evaluation()
+        self.settings = TaskSettings.of(robot, direction).evaluation()
 
     def walks(self, mu: Array, condition: Array, seed: int) -> Walks:
         """One episode for each row of mu, on the unit scale, and its condition."""

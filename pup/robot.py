@@ -22,6 +22,7 @@ from pup.robot_parts import (
     ParameterSpec,
     Scaling,
     TermSpec,
+    Walk,
 )
 from pup.robot_reader import (
     read_actuator,
@@ -34,6 +35,7 @@ from pup.robot_reader import (
     read_poses,
     read_timestep,
     read_torso,
+    read_walk,
 )
 from pup.robot_space import read_knobs, read_parameters
 from pup.robot_terms import read_terms
@@ -51,6 +53,7 @@ __all__ = [
     "RobotDescription",
     "Scaling",
     "TermSpec",
+    "Walk",
     "built_in_robots",
 ]
 
@@ -76,6 +79,7 @@ class RobotDescription:
       parameters: the parameter space, in order.
       terms: what the physics has beside the nominal model.
       gait: the reference motion, if any.
+      walk: what of the walking task goes by its size.
       network: options of the NN-PD actuator; None where it is not offered.
       actuator: the torque law to use when none is asked for.
       timestep: physics step, s.
@@ -95,6 +99,7 @@ class RobotDescription:
     parameters: tuple[ParameterSpec, ...]
     terms: tuple[TermSpec, ...]
     gait: Gait | None
+    walk: Walk
     network: NetworkOptions | None
     actuator: Actuator
     timestep: float
@@ -135,6 +140,7 @@ class RobotDescription:
             parameters=parameters,
             terms=read_terms(table, joints, groups, feet, model),
             gait=read_gait(table, joints, poses, feet, model),
+            walk=read_walk(table),
             network=network,
             actuator=read_actuator(table, network),
             timestep=read_timestep(table),

@@ -145,7 +145,7 @@ class Gait:
       tilt_limit: largest roll and pitch of a torso that has not fallen, rad.
       drift_limit: largest way of the torso across the walking direction, or up or down, m.
       ground_bodies: the bodies that may touch the floor.
-      imu_pitch_offset: what the IMU reports of the pitch is less than the pitch by this, rad.
+      imu_pitch_offset: taken off the pitch that the IMU reports before a policy sees it, rad.
     """
 
     period: float
@@ -166,6 +166,23 @@ class Gait:
             turn = 2 * np.pi * phase[..., None] * np.arange(1, len(a) + 1)
             columns.append(c0 + np.cos(turn) @ np.array(a) + np.sin(turn) @ np.array(b))
         return np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What of the walking task goes by a robot's size; the defaults are for the paper's OP2.
+
+    Attributes:
+      control_rate: slowest and fastest rate of control, Hz (paper, VI-B).
+      substeps: physics steps per control step.
+      effort: cost per (N m)² of the servos' torques (paper, VI-A: w_a).
+      work: cost per W of the servos' power (w_w).
+    """
+
+    control_rate: tuple[float, float] = (25.0, 33.0)
+    substeps: int = 8
+    effort: float = 0.01
+    work: float = 0.005
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pup.robot_parts import (
     Joint,
     NetworkOptions,
     ParameterSpec,
+    Walk,
 )
 from pup.robot_toml import Table, listed
 
@@ -228,6 +229,45 @@ def read_gait(
         if body not in model.bodies:
             raise section.mistake("ground_bodies", absent("body", body))
     return gait
+
+
+def read_walk(table: Table) -> Walk:
+    """Read what of the walking task goes by the robot's size; what is left out is as the OP2's."""
+    section, default = table.table("walk"), Walk()
+    slowest, fastest = section.numbers("control_rate", 2, default.control_rate)
+    substeps = section.integer("substeps")
+    walk = Walk(
+        control_rate=(slowest, fastest),
+        substeps=default.substeps if substeps is None else substeps,
+        effort=section.number("effort", default.effort),
+        work=section.number("work", default.work),
+    )
+    section.close()
+    if not 0 < slowest <= fastest:
+        raise section.mistake(
+            "control_rate",
+            f"[{slowest:g}, {fastest:g}] Hz; write [slowest, fastest], both above 0",
+        )
+    if walk.substeps < 1:
+        raise section.mistake("substeps", f"{walk.substeps} is less than 1")
+    for key in ("effort", "work"):
+        if getattr(walk, key) < 0:
+            raise section.mistake(key, f"{getattr(walk, key):g} is negative")
+    _check_substeps(section, walk)
+    return walk
+
+
+def _check_substeps(section: Table, walk: Walk) -> None:
+    """Refuse sub-steps that no robot's physics may have."""
+    low, high = TIMESTEPS
+    slowest, fastest = walk.control_rate
+    for step in (1 / slowest / walk.substeps, 1 / fastest / walk.substeps):
+        if not low <= step <= high:
+            raise section.mistake(
+                "substeps",
+                f"{walk.substeps} a control step take {step:g} s each, outside "
+                f"[{low:g}, {high:g}] s",
+            )
 
 
 def _start(section: Table, poses: dict[str, tuple[float, ...]]) -> tuple[float, ...] | None:

@@ -138,9 +138,13 @@ class Table:
             raise self._wrong(key, value, "a list of texts")
         return tuple(value)
 
-    def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
-        """Take a required list of finite numbers, of a given length when `count` is given."""
+    def numbers(
+        self, key: str, count: int | None = None, default: tuple[float, ...] | None = None
+    ) -> tuple[float, ...]:
+        """Take a list of finite numbers, of a given length when `count` is given."""
         value = self._take(key)
+        if value is None and default is not None:
+            return default
         if not isinstance(value, list) or not all(_is_number(item) for item in value):
             raise self._wrong(key, value, "a list of finite numbers")
         if count is not None and len(value) != count:

@@ -85,7 +85,7 @@ def rehearse(
     bundle, digest = NumpyPolicy.load(policy, robot), sha256(policy / CARD)
     walked = read_walked(study, bundle, digest)
     fitted = read_bounds(bounds, robot)
-    task = TaskSettings(direction=Direction(bundle.card.direction)).evaluation()
+    task = TaskSettings.of(robot, Direction(bundle.card.direction)).evaluation()
     # The error of an IMU is drawn anew for each walk in a training; a robot has the one it has.
     task = replace(task, horizon=walked.horizon, tilt_bias=0.0)
     eta = np.repeat(walked.eta, EPISODES, axis=0)

@@ -72,7 +72,7 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     eta = None if shown.eta is None else _eta(policy, shown.eta)
     if shown.landscape and not policy.card.shape.eta:
         raise InputError(f"{shown.policy}: is conditioned on nothing; leave --landscape out")
-    settings = TaskSettings(direction=Direction(policy.card.direction)).evaluation()
+    settings = TaskSettings.of(robot, Direction(policy.card.direction)).evaluation()
 
     def act(seen: NDArray[np.float32], mu: NDArray[np.float32]) -> Array:
         return policy.act(seen, policy.project(mu) if eta is None else eta)

@@ -18,9 +18,9 @@ SQUAT = np.array(OP2.poses["half_squat"])
 FLOOR = '<geom name="floor" '
 SITE = '<site name="imu" pos="0 0 -0.068"/>'
 HOLDER = """
-  <body name="holder" euler="30 0 90" pos="0 0 0.01">
+  <body name="holder" euler="0.1 0 0.15" pos="0 0 0.01">
     <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/>
-    <body euler="0 40 0"><site name="imu" euler="10 0 0"/></body>
+    <body euler="0 0.12 0"><site name="imu" euler="0.1 0 0"/></body>
   </body>"""
 
 

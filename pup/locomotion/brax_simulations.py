@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.locomotion.simulations import FASTEST, Motion, Part, Pose, Rows, sense_drift
+from pup.locomotion.simulations import FASTEST, Motion, Part, Pose, Rows, may_touch, sense_drift
 from pup.physics.actuators import LAWS
 from pup.physics.brax_engine import (
     Bodies,
@@ -23,7 +23,7 @@ from pup.physics.brax_engine import (
 )
 from pup.physics.brax_servos import Last, Law, Servos, law_of
 from pup.physics.live import DELAY, has_terms
-from pup.physics.model import FLOOR, Model
+from pup.physics.model import Model
 from pup.physics.parameters import Candidates
 from pup.robot import RobotDescription
 
@@ -66,7 +66,7 @@ class BraxSimulations(Part):
         with jax.enable_x64(False):
             self.system = put_system(robot, "ground", largest.space, _sense)
         self.law = law_of(LAWS[actuator])
-        stride = partial(_stride, self.system, self.model, self.law, _allowed(robot, self.model))
+        stride = partial(_stride, self.system, self.model, self.law, may_touch(robot, self.model))
         self.stride = jax.jit(partial(stride, substeps))
         joints = np.zeros((n, len(robot.joints)))
         velocity = np.zeros_like(self.qvel)
@@ -160,16 +160,6 @@ def _stride(
     torque = last.acted(moved.qvel[:, model.dofs])
     seen = moved.qpos, moved.qvel, torque, drift[-1], touching[-1], lost
     return moved, last, seen
-
-
-def _allowed(robot: RobotDescription, model: Model) -> NDArray[np.bool_]:
-    """Which geoms may touch which, shape (n_geoms, n_geoms): the floor and allowed bodies'."""
-    assert robot.gait is not None
-    compiled = model.compiled
-    bodies = [compiled.body(name).id for name in robot.gait.ground_bodies]
-    floor = np.arange(compiled.ngeom) == compiled.geom(FLOOR).id
-    pairs = np.outer(np.isin(compiled.geom_bodyid, bodies), floor)
-    return np.asarray(pairs | pairs.T)
 
 
 def _sense(robot: RobotDescription, spec: mujoco.MjSpec) -> None:

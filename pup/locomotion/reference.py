@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.robot import Gait
+from pup.errors import InputError
+from pup.robot import Gait, RobotDescription
 
 Array = NDArray[np.float64]
 
@@ -44,3 +45,21 @@ class Reference:
         if self.gait.blend > 0:
             share = np.minimum(time / self.gait.blend, 1.0)
         return np.asarray(self.start + share[:, None] * (gait - self.start))
+
+
+def gait_of(robot: RobotDescription) -> Gait:
+    """The robot's gait, if it can walk.
+
+    Raises:
+      InputError: it cannot; the message says what it lacks.
+    """
+    file = robot.folder / "robot.toml"
+    if robot.gait is None:
+        raise InputError(
+            f"{file}: robot {robot.name!r} has no [gait] to learn walking from; add one"
+        )
+    if not robot.floating or not robot.feet:
+        raise InputError(
+            f"{file}: robot {robot.name!r} cannot walk: it needs a free joint in model.xml and feet"
+        )
+    return robot.gait

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from pup.robot import RobotDescription, Walk
+
 
 class Direction(StrEnum):
     """Where to walk, as seen by the robot."""
@@ -35,6 +37,8 @@ class Direction(StrEnum):
 @dataclass(frozen=True)
 class TaskSettings:
     """Everything about the task that is not the robot's; the defaults train as the paper does.
+
+    Whoever has a robot makes them by `of`: what goes by its size stands in its `[walk]`.
 
     "Authors" is their public code (dart-env, DartDarwinSquat-v1), where the paper is silent.
 
@@ -70,7 +74,7 @@ class TaskSettings:
     on_course: bool = True
     bins: int = 11
     smoothing: int = 5
-    control_rate: tuple[float, float] = (25.0, 33.0)
+    control_rate: tuple[float, float] = Walk.control_rate
     position_noise: float = 0.01
     tilt_bias: float = 0.3
     tilt_noise: float = 0.01
@@ -79,12 +83,24 @@ class TaskSettings:
     start_position_noise: float = 0.01
     start_velocity_noise: float = 0.005
     speed_weight: float = 10.0
-    torque_weight: float = 0.01
-    work_weight: float = 0.005
+    torque_weight: float = Walk.effort
+    work_weight: float = Walk.work
     tracking_weight: float = 0.2
     alive: float = 5.0
     lateral_weight: float = 2.0
-    substeps: int = 8
+    substeps: int = Walk.substeps
+
+    @classmethod
+    def of(cls, robot: RobotDescription, direction: Direction) -> "TaskSettings":
+        """The task for a robot of its size."""
+        walk = robot.walk
+        return cls(
+            direction=direction,
+            control_rate=walk.control_rate,
+            substeps=walk.substeps,
+            torque_weight=walk.effort,
+            work_weight=walk.work,
+        )
 
     def evaluation(self) -> "TaskSettings":
         """The same task to its end or a fall, with the policy told the true parameters."""

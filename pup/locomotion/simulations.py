@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pup.physics.actuators import LAWS
 from pup.physics.limited import LimitedLaw
 from pup.physics.live import LiveServos, has_terms, paced
-from pup.physics.model import FLOOR, compile_model, joint_inertia, lowest_point
+from pup.physics.model import FLOOR, Model, compile_model, joint_inertia, lowest_point
 from pup.physics.outfit import Outfit, fit_out
 from pup.physics.parameters import Candidates
 from pup.physics.writer import RowWriter
@@ -346,6 +346,16 @@ def _sense(robot: RobotDescription, spec: mujoco.MjSpec) -> None:
             refname=FLOOR,
             intprm=[_COUNT, 0, 1],
         )
+
+
+def may_touch(robot: RobotDescription, model: Model) -> NDArray[np.bool_]:
+    """Which geoms may touch which, shape (n_geoms, n_geoms): the floor and allowed bodies'."""
+    assert robot.gait is not None
+    compiled = model.compiled
+    bodies = [compiled.body(name).id for name in robot.gait.ground_bodies]
+    floor = np.arange(compiled.ngeom) == compiled.geom(FLOOR).id
+    pairs = np.outer(np.isin(compiled.geom_bodyid, bodies), floor)
+    return np.asarray(pairs | pairs.T)
 
 
 def sense_drift(robot: RobotDescription, spec: mujoco.MjSpec) -> None:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.errors import InputError
 from pup.locomotion.engines import make_simulations
-from pup.locomotion.reference import Reference
+from pup.locomotion.falls import Falls
+from pup.locomotion.reference import Reference, gait_of
 from pup.locomotion.sampling import MARGIN, ParameterSampler
 from pup.locomotion.settings import TaskSettings
 from pup.locomotion.simulations import Motion, Pose
@@ -22,7 +22,7 @@ from pup.locomotion.start import Starts
 from pup.physics.engine import Engine
 from pup.physics.outfit import mount
 from pup.physics.rotations import heading, multiply, roll_pitch
-from pup.robot import Gait, RobotDescription
+from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -140,7 +140,14 @@ class WalkingTask:
 
     Raises:
       InputError: the robot cannot walk, a term of it cannot act, or the engine does not do.
+
+    Attributes:
+      motion: what the last control step left.
+      falls: by what robots fell in it.
     """
+
+    motion: Motion
+    falls: Falls
 
     def __init__(
         self,
@@ -153,7 +160,7 @@ class WalkingTask:
         engine: Engine = Engine.MUJOCO,
     ) -> None:
         self.robot = robot
-        self.gait = _gait(robot)
+        self.gait = gait_of(robot)
         self.sampler = sampler
         self.settings = settings
         self.n = n
@@ -207,12 +214,13 @@ class WalkingTask:
         """
         episodes, live = self._episodes, ~self._episodes.over
         reference = self.reference.angles(episodes.time)
-        motion = self._simulations.step(self._target(reference, action), live)
+        self.motion = motion = self._simulations.step(self._target(reference, action), live)
         before = episodes.place
         episodes.place = np.where(motion.lost[:, None], before, motion.root[:, :3])
         episodes.time = episodes.time + episodes.period
         self._read(motion)
-        terminated = live & self._fallen(motion)
+        self.falls = self._fallen(motion)
+        terminated = live & self.falls.any()
         truncated = live & ~terminated & (episodes.time >= self.settings.horizon)
         velocity = (episodes.place - before) / episodes.period[:, None]
         speed = velocity[:, :2] @ self._axis
@@ -311,17 +319,11 @@ class WalkingTask:
         target = reference + settings.direction.reach * mean
         return np.asarray(np.clip(target, self.lower, self.upper))
 
-    def _fallen(self, motion: Motion) -> Flags:
-        """Where an episode ends otherwise than by time."""
+    def _fallen(self, motion: Motion) -> Falls:
+        """By what episodes end otherwise than by time."""
         moved = self._episodes.place - self._episodes.start
-        tilt = np.abs(roll_pitch(motion.root[:, 3:])).max(axis=1)
-        return np.asarray(
-            motion.lost
-            | motion.touching
-            | (tilt > self.gait.tilt_limit)
-            | self._off_course(moved)
-            | (np.abs(moved[:, 2]) > self.gait.drift_limit)
-        )
+        aside = self.settings.on_course * np.abs(moved[:, :2] @ self._across)
+        return Falls.of(motion, moved[:, 2], aside, self.gait)
 
     def _course(self, root: Array, velocity: Array, rows: Rows) -> Array:
         """See COURSE; of some simulations, shape (n_rows, len(COURSE))."""
@@ -335,10 +337,6 @@ class WalkingTask:
             self.phase()[rows],
         )
         return np.concatenate(parts, axis=1)
-
-    def _off_course(self, moved: Array) -> Flags:
-        aside = np.abs(moved[:, :2] @ self._across)
-        return np.asarray(self.settings.on_course & (aside > self.gait.drift_limit))
 
     def _reward(self, motion: Motion, reference: Array, speed: Array) -> Array:
         """The paper's reward (section VI-A) less the authors' cost of swaying."""
@@ -395,17 +393,3 @@ _FIELDS = fields(_Episodes)
 def _dot(a: Array, b: Array) -> Array:
     """Row by row."""
     return np.asarray(np.einsum("ij,ij->i", a, b))
-
-
-def _gait(robot: RobotDescription) -> Gait:
-    """The robot's gait, if it can walk."""
-    file = robot.folder / "robot.toml"
-    if robot.gait is None:
-        raise InputError(
-            f"{file}: robot {robot.name!r} has no [gait] to learn walking from; add one"
-        )
-    if not robot.floating or not robot.feet:
-        raise InputError(
-            f"{file}: robot {robot.name!r} cannot walk: it needs a free joint in model.xml and feet"
-        )
-    return robot.gait

@@ -57,6 +57,9 @@ LEVEL = 1 - 1e-9
 """Least vertical part of the normal of a floor that is level."""
 TURNS = 4 * np.pi
 """Limits that a hinge without a range may have, rad."""
+ASKEW = 20.0
+"""Degrees by which a walking robot's IMU may be turned in the torso: what is left of its mounting
+after the agent has told it as the torso's angles."""
 
 Extension = Callable[[RobotDescription, mujoco.MjSpec], None]
 
@@ -108,16 +111,18 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
             "the recording's support should be 'bench'"
         )
     _check_limits(robot, compiled)
-    if floating:
-        _check_floor(robot, compiled)
     ids = [compiled.joint(name).id for name in robot.joint_names]
-    return Model(
+    model = Model(
         compiled,
         _selection(compiled.jnt_qposadr[ids]),
         _selection(compiled.jnt_dofadr[ids]),
         floating,
         _contacts(robot, compiled),
     )
+    if floating:
+        _check_floor(robot, compiled)
+        _check_mount(robot, model)
+    return model
 
 
 def _check_limits(robot: RobotDescription, model: mujoco.MjModel) -> None:
@@ -153,6 +158,22 @@ def _check_floor(robot: RobotDescription, model: mujoco.MjModel) -> None:
                 f"{robot.model_path}: the geom {FLOOR!r} is not level; leave its orientation out "
                 "(the effect 'ground_slope' makes the ground lean)"
             )
+
+
+def _check_mount(robot: RobotDescription, model: Model) -> None:
+    """Refuse an IMU turned as its chip is, where a policy would take roll for pitch on the robot.
+
+    Replays and the walking task turn the torso's angles by the site; a robot's agent does not.
+    """
+    if robot.gait is None:
+        return
+    turned = np.degrees(2 * np.arccos(min(1.0, abs(mount(robot, model)[0]))))
+    if turned > ASKEW:
+        raise InputError(
+            f"{robot.model_path}: the site {robot.imu_site!r} is turned by {turned:.0f} degrees "
+            f"against the torso; leave at most {ASKEW:g}, and tell how the chip is mounted by "
+            "roll, pitch, yaw and axes of the agent's [imu]"
+        )
 
 
 def _floors(model: mujoco.MjModel) -> list[int]:
