@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -55,7 +56,7 @@ def training(options: argparse.Namespace) -> Iterator[int]:
     """Where a training runs; gives the cores there are for it."""
     from workers.cluster import connected, cores_there
 
-    if not options.address and options.runners > cores(options):
+    if (options.cores or not options.address) and options.runners > cores(options):
         raise InputError(
             f"--runners {options.runners} on {cores(options)} cores; use at most one for each core"
         )
@@ -64,24 +65,43 @@ def training(options: argparse.Namespace) -> Iterator[int]:
 
 
 def _shared_out(options: argparse.Namespace) -> int:
-    """Cores of a cluster for a training.
+    """Cores of a cluster for a training: as many for each of its runners as one node has for it.
 
     Raises:
       InputError: some runners would wait for ever.
       FailedError: others have the cores, or nodes are away; there may be room another time.
     """
+    from workers import nodes
     from workers.cluster import cores_free, cores_in_all
 
-    if options.cores or not options.runners:
+    runners = options.runners
+    if not runners:
         return cores(options)  # without runners this process does all
-    if options.runners > (free := cores_free()):
-        if options.runners < cores_in_all():
-            raise FailedError(f"{free} cores of the cluster are free for {options.runners} runners")
-        raise InputError(
-            f"--runners {options.runners}, where {free} cores of the cluster are free beside this "
-            "process; use fewer, or say by --cores how many there will be on one that grows"
-        )
-    return free
+    if options.cores:
+        _tell_who_waits(runners, options.cores)
+        return cores(options)
+    if share := nodes.largest_share(nodes.cores_free(), runners):
+        return share * runners
+    free = cores_free()
+    if runners < cores_in_all():
+        raise FailedError(f"{free} cores of the cluster are free for {runners} runners")
+    raise InputError(
+        f"--runners {runners}, where {free} cores of the cluster are free beside this "
+        "process; use fewer, or say by --cores how many there will be on one that grows"
+    )
+
+
+def _tell_who_waits(runners: int, in_all: int) -> None:
+    """Say so where a cluster has no room for the runners yet; it may grow, so they wait for it."""
+    from workers import nodes
+
+    share = in_all // runners
+    there = nodes.room(nodes.cores_free(), share)
+    if there < runners:
+        largest = max(nodes.cores_whole(), default=0)
+        line = f"--runners {runners} --cores {in_all}: waiting for nodes with {share} free cores "
+        line += f"for each runner; there is room for {there}, and the largest node has {largest}"
+        print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from pup.errors import InputError
 from pup.files import sha256, write_json
 from pup.locomotion.engines import check_size
-from pup.locomotion.sampling import MARGIN
+from pup.locomotion.sampling import MARGIN, ParameterSampler
 from pup.locomotion.settings import TaskSettings
+from pup.locomotion.standing import check_start
 from pup.locomotion.task import WalkingTask
 from pup.physics.engine import Engine
 from pup.policy.bundle import CARD, NumpyPolicy, PolicyCard, Weights, read_bundle, write_bundle
@@ -35,7 +36,7 @@ from services.first_gait import FirstGait, Said, read_gait
 from services.provenance import ALSO, engine, now
 from services.tracking import Trackers
 from services.training_options import Options
-from workers.ppo import Iteration, Setup, Trainer
+from workers.ppo import Iteration, Setup, Trainer, runners_before
 from workers.rollouts import Sampling
 from workers.walking import Walking
 
@@ -105,11 +106,12 @@ class _Job:
             )
         self.bounds = read_bounds(self.source, robot)
         self.bounds_sha256 = sha256(self.source)
-        self.settings = TaskSettings(direction=options.direction)
+        self.settings = TaskSettings.of(robot, options.direction)
         nominal = options.method == Method.NOMINAL
         check_size(options.engine, options.simulations)
         self.walking = Walking(robot, self.bounds, self.settings, nominal, options.engine)
         task = self.walking(1, 0, 1)
+        check_start(robot, ParameterSampler.nominal(self.bounds), self.settings)
         self.shape = PolicyShape.of(
             options.method,
             len(task.observation_names),
@@ -121,19 +123,21 @@ class _Job:
         self.card = self._card(task)
         self.origin: dict[str, Any] | None = None
         self.first = self._first()
-        self.iterations = math.ceil(options.steps / self._per_iteration())
         self.learning = replace(
             options.learning,
-            iterations=self.iterations,
+            iterations=math.ceil(options.steps / self._per_iteration(options.runners)),
             seed=options.seed,
             mirror=self._mirror(task),
         )
         self.kept = Checkpoint(out / "checkpoint.npz", self._digest())
         self.rows, self.lost, self.seconds = self.kept.rows, self.kept.lost, self.kept.seconds
+        self.runners_before = runners_before(self.kept.state, options.runners)
+        iterations = int(self.kept.state.get("learner/iteration", 0))
+        self.asked = iterations * self._per_iteration(self.runners_before)  # steps, lost or not
 
     def run(self, cluster: Callable[[], AbstractContextManager[int]]) -> dict[str, Any]:
         trackers = Trackers(self.options.track, self.out, len(self.rows), self._told_options())
-        if len(self.rows) < self.iterations:
+        if self.asked < self.options.steps:
             with cluster() as cores, trackers:
                 self._go_on(cores, trackers)
         document = self._document(done=True)
@@ -148,16 +152,18 @@ class _Job:
         with closing(Trainer(setup)) as trainer:
             if self.kept.state:
                 trainer.restore(self.kept.state)
+                if self.runners_before != self.options.runners:
+                    self._with_other_runners()
             written, best = time.monotonic(), self._best()
             found: Weights | None = None
-            while len(self.rows) < self.iterations:
+            while self.asked < self.options.steps:
                 row = self._iterate(trainer)
                 trackers.tell(row, len(self.rows))
                 if self._smoothed(len(self.rows)) > best:
                     best, found = self._smoothed(len(self.rows)), trainer.weights()
                 due = time.monotonic() - written > CHECKPOINT_SECONDS
                 # The last checkpoint tells that all is done: it comes after the policy.
-                if due and len(self.rows) < self.iterations:
+                if due and self.asked < self.options.steps:
                     self._write(trainer, found)
                     written, found = time.monotonic(), None
             self._bundle("policy", trainer.weights())
@@ -175,8 +181,17 @@ class _Job:
         self.seconds += time.monotonic() - begin
         row = _row(told, self.rows[-1]["steps"] if self.rows else 0, self.seconds)
         self.rows.append(row)
+        self.asked += self._per_iteration(self.options.runners)
         self.told(row, self.options.steps)
         return row
+
+    def _with_other_runners(self) -> None:
+        """Go on with others than before: by whole iterations of theirs, as the learner does."""
+        now, each = self.options.runners, self._per_iteration(self.options.runners)
+        self.asked = math.ceil(self.asked / each) * each
+        line = f"--runners {now} after {self.runners_before} before: weights will not be to the "
+        line += "last bit those of a training that was not stopped"
+        print(line, file=sys.stderr, flush=True)
 
     def _sampled(self, trainer: Trainer) -> Iteration:
         """An iteration that learnt something; runners that are all lost are waited for.
@@ -184,15 +199,22 @@ class _Job:
         Raises:
           ConnectionError: they do not come back.
         """
+        trouble = ""
         for turn in range(MOST_EMPTY):
             if turn:
                 stopping.check()
                 time.sleep(EMPTY_SECONDS)
             told = trainer.iterate()
             self.lost += told.lost
+            if told.trouble and told.trouble != trouble:
+                trouble = told.trouble
+                print(f"{told.lost} steps lost: {trouble}", file=sys.stderr, flush=True)
             if told.steps:
                 return told
-        raise ConnectionError("all runners were lost and none came back; the same command resumes")
+        raise ConnectionError(
+            f"all runners were lost and none came back ({trouble}); the same command resumes, with "
+            "fewer --runners too"
+        )
 
     def _write(self, trainer: Trainer, best: Weights | None) -> None:
         """A checkpoint; after the best policy so far, which it does not hold."""
@@ -242,9 +264,8 @@ class _Job:
         sampling = Sampling(self.walking, o.simulations, o.length, o.seed, threads)
         return Setup(self.shape, sampling, self.learning, o.runners, share, o.seed, self.first)
 
-    def _per_iteration(self) -> int:
-        o = self.options
-        return max(1, o.runners) * o.simulations * o.length
+    def _per_iteration(self, runners: int) -> int:
+        return max(1, runners) * self.options.simulations * self.options.length
 
     def _mirror(self, task: WalkingTask) -> MirrorMap | None:
         wanted = self.options.learning.weights.mirror and self.options.direction.symmetric
@@ -318,8 +339,11 @@ class _Job:
         return dict(json.loads(json.dumps(told, default=str)))
 
     def _digest(self) -> str:
-        """Of all that the weights depend on."""
-        told = self._told_options()
+        """Of all that the weights depend on, but for the runners.
+
+        When a node is lost for good, a training shall go on with fewer.
+        """
+        told = self._told_options() | {"runners": 0}
         del told["track"]
         if self.options.engine is Engine.MUJOCO:
             del told["engine"]  # as before there were two

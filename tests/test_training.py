@@ -127,9 +127,9 @@ def test_samples_of_older_weights_are_weighted(bias: float) -> None:
     load(now.policy, {k: v.numpy() for k, v in policy().state_dict().items()})
     with torch.no_grad():
         now.policy.actor[-1].bias[5 * SHAPE.joints : 6 * SHAPE.joints] += bias  # the middle
+    drawn = prepared(now, fragment, LEARNING)
     batch = FragmentsToBatch(LEARNING)(rl_module={DEFAULT_MODULE_ID: now}, episodes=[fragment])
     told = Samples(**batch[DEFAULT_MODULE_ID])
-    drawn = prepared(now, fragment, LEARNING)
     order = torch.from_numpy(shuffled(len(drawn.log), LEARNING, np.random.default_rng((0, 0))))
     taken = (drawn.bins == 5).sum(dim=1)[order]
     ratio = (told.log - drawn.log[order]).exp()
@@ -161,8 +161,8 @@ def test_a_runner_that_was_lost_leaves_the_others_their_states() -> None:
 
     def trainer(*runners: SimpleNamespace) -> Trainer:
         made = Trainer.__new__(Trainer)
-        made.runners = 3
-        learner = SimpleNamespace(get=dict)
+        made.setup = replace(TOY, runners=3)
+        learner = SimpleNamespace(get=lambda: {"iteration": np.array(2)})
         made.algorithm = SimpleNamespace(
             settle=lambda: None,
             coming=list,
@@ -321,19 +321,20 @@ def weights_of(out: Path) -> dict[str, np.ndarray]:
 
 
 def test_runners_that_do_not_come_back_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """After a while; before, one that comes back has the training go on."""
     monkeypatch.setattr(training, "EMPTY_SECONDS", 0.0)
-    empty = Iteration(0, 32, np.empty((0, 4)), np.nan, (0.0, 0.0), {})
-    whole = replace(empty, steps=32, lost=0, reward=1.0)
+    empty = Iteration(0, 32, np.empty((0, 4)), np.nan, (0.0, 0.0), {}, "runner 2: no memory")
+    whole = replace(empty, steps=32, lost=0, reward=1.0, trouble="")
     told = [*[empty] * (training.MOST_EMPTY - 1), whole]
     trainer = SimpleNamespace(iterate=lambda: told.pop(0) if told else empty)
     one = training._Job(ROBOT, None, SMALL, tmp_path, lambda row, steps: None, lambda *_: None)
     assert one._iterate(trainer)["steps"] == 32
     assert one.lost == 32 * (training.MOST_EMPTY - 1)
-    with pytest.raises(ConnectionError, match="all runners were lost"):
+    with pytest.raises(ConnectionError, match=r"all runners were lost.*\(runner 2: no memory\)"):
         one._iterate(trainer)
+    assert capsys.readouterr().err.splitlines() == 2 * ["32 steps lost: runner 2: no memory"]
 
     def stopped() -> None:
         raise KeyboardInterrupt

@@ -87,7 +87,7 @@ class FragmentsToBatch(ConnectorV2):
         module = rl_module[DEFAULT_MODULE_ID].unwrapped()
         samples = merged([prepared(module, f, self.learning) for f in episodes])
         policy = module.policy
-        module.shown = samples.proprioception, samples.returns
+        module.shown = samples.proprioception, _unknown(policy, samples.returns)
         log = likelihoods(policy, samples)
         importance = (log - samples.log).exp().clamp(max=IMPORTANCE)
         scaled = samples._replace(
@@ -161,6 +161,19 @@ def merged(samples: Sequence[Samples]) -> Samples:
     if len(samples) == 1:
         return samples[0]
     return Samples(*(torch.cat(columns) for columns in zip(*samples, strict=True)))
+
+
+def _unknown(policy: ProjectedPolicy, returns: torch.Tensor) -> torch.Tensor | None:
+    """Returns to be learnt after the steps; None of the first ones, which are learnt here.
+
+    Without a scale of them the value function's gradient would be as large as the rewards happen
+    to be, and the clip, which is common to both, would leave the actor nothing. As values mean
+    nothing yet, there is nothing that their last layer is to be moved for.
+    """
+    if policy.returns.count:
+        return returns
+    policy.returns.update(returns[:, None])
+    return None
 
 
 def _standard(values: torch.Tensor) -> torch.Tensor:
@@ -249,13 +262,15 @@ class MirrorLearner(PPOTorchLearner):
     def after_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
         """Normalisers learn after the steps: all of an iteration's samples share their statistics.
 
+        That of the returns has learnt its first ones before (`_unknown`).
         RLlib's schedules are left out: they follow counts that a restored training does not have.
         See Learner.
         """
         module = self.policy_module
         seen, returns = module.shown
         module.policy.observations.update(seen)
-        module.policy.learn_returns(returns)
+        if returns is not None:
+            module.policy.learn_returns(returns)
         module.policy.sharpen(self.learning.sharpen ** (1 / self.learning.iterations))
         del module.shown
         self.iteration += 1

@@ -1,12 +1,13 @@
 """PPO on RLlib from batched tasks: the algorithm, its configuration, and its exact state."""
 
 import logging
+import math
 import tempfile
 import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import gymnasium
@@ -19,11 +20,13 @@ from ray.rllib.algorithms.ppo import PPO, PPOConfig
 from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_RL_MODULE, DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
+from pup.errors import InputError
 from pup.policy.losses import Losses
 from pup.policy.shape import PolicyShape
 from workers.learner import FragmentsToBatch, Learning, MirrorLearner
 from workers.module import PolicyModule
 from workers.rollouts import BatchRunner, Fragment, Sampling, spaces
+from workers.runners import LEAST_SECONDS, Crew
 
 State = dict[str, NDArray[Any]]
 GPU_MINIBATCH = 1024
@@ -70,6 +73,7 @@ class Iteration:
       reward: mean of a live step.
       seconds: of waiting for samples and of learning.
       learnt: means of the losses, the rate.
+      trouble: why runners were lost, where some were.
     """
 
     steps: int
@@ -78,6 +82,7 @@ class Iteration:
     reward: float
     seconds: tuple[float, float]
     learnt: dict[str, float]
+    trouble: str = ""
 
 
 class BatchPPO(PPO):
@@ -93,6 +98,7 @@ class BatchPPO(PPO):
     def setup(self, config: Any) -> None:
         """See Algorithm."""
         super().setup(config)
+        self.crew = Crew(self.env_runner_group)
         self._thread = ThreadPoolExecutor(1, "sampling")
         self._coming: Future[list[Fragment]] | None = None
 
@@ -103,17 +109,19 @@ class BatchPPO(PPO):
 
     def cleanup(self) -> None:
         """See Algorithm."""
-        super().cleanup()  # stops what is being sampled
+        self.env_runner_group._worker_manager.clear()  # RLlib would wait for what they sample
+        super().cleanup()  # stops what is being sampled here
         self._thread.shutdown()
         self._folder.cleanup()
 
     def training_step(self) -> None:
         """See Algorithm."""
         begin = time.perf_counter()
-        fragments = self.coming()
+        fragments, trouble = self.coming(), self.crew.trouble
         self.begin()
         if not fragments:
-            self.told = Iteration(0, self._expected(), np.empty((0, 4)), np.nan, (0.0, 0.0), {})
+            none, lost = np.empty((0, 4)), self._expected()
+            self.told = Iteration(0, lost, none, np.nan, (0.0, 0.0), {}, trouble)
             return
         sampled = time.perf_counter()
         results = self.learner_group.update(episodes=fragments, timesteps={})
@@ -127,6 +135,7 @@ class BatchPPO(PPO):
             reward=float(sum(f.reward.sum(dtype=np.float64) for f in fragments) / live),
             seconds=(sampled - begin, time.perf_counter() - sampled),
             learnt=_numbers(results[0][DEFAULT_MODULE_ID]),
+            trouble=trouble,
         )
 
     def coming(self) -> list[Fragment]:
@@ -159,12 +168,10 @@ class BatchPPO(PPO):
         return int(self.config.train_batch_size)
 
     def _sampled(self) -> list[Fragment]:
-        """A fragment of each runner that answers, in their order."""
         group = self.env_runner_group
-        if not group.num_remote_env_runners():
-            return group.local_env_runner.sample()
-        told = group.foreach_env_runner(lambda runner: runner.sample(), local_env_runner=False)
-        return [fragment for one in told for fragment in one]
+        if group.num_remote_env_runners():
+            return self.crew.sample()
+        return group.local_env_runner.sample()
 
     def _broadcast(self) -> None:
         """Give the runners the learner's weights; a runner in this process needs no Ray for it."""
@@ -199,7 +206,12 @@ def learner_place(minibatch: int, here: bool, anywhere: bool, shared: bool) -> t
 
 
 def _start(setup: Setup) -> BatchPPO:
-    """Build the algorithm on the Ray this process is connected to."""
+    """Build the algorithm on the Ray this process is connected to.
+
+    Raises:
+      InputError: a runner cannot make its task.
+      ConnectionError: the first runner was lost.
+    """
     for name in ("ray", "ray.rllib"):
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
@@ -222,7 +234,6 @@ def _start(setup: Setup) -> BatchPPO:
             num_env_runners=setup.runners,
             num_cpus_per_env_runner=setup.cores,
             rollout_fragment_length=setup.sampling.steps,
-            sample_timeout_s=None,
             merge_env_runner_states=False,
             broadcast_env_runner_states=False,
         )
@@ -261,7 +272,21 @@ def _start(setup: Setup) -> BatchPPO:
         )
         .debugging(log_level="ERROR")
     )
-    return config.build_algo()
+    try:
+        algorithm = config.build_algo()
+    except IndexError as error:  # RLlib takes the first answer of the first runner, of none too
+        if not setup.runners:
+            raise
+        raise ConnectionError(
+            "a runner was lost while it started, perhaps for want of memory; the same command "
+            "resumes"
+        ) from error
+    try:
+        algorithm.crew.check()
+    except InputError:
+        algorithm.stop()
+        raise
+    return algorithm
 
 
 class Trainer:
@@ -273,7 +298,7 @@ class Trainer:
 
     def __init__(self, setup: Setup) -> None:
         self.algorithm = _start(setup)
-        self.runners = setup.runners
+        self.setup = setup
 
     def iterate(self) -> Iteration:
         """Sample and learn.
@@ -302,13 +327,21 @@ class Trainer:
         # By their index: one that was lost, and does not answer, leaves the others in their places.
         for place, runner in self.each_runner(lambda one: (_place(one), one.sampler.state())):
             told |= {f"runner{place}/{k}": v for k, v in runner.items()}
-        return told
+        return told | {"runners": np.array(self.setup.runners)}
 
     def restore(self, state: State) -> None:
-        """Go on where another training with as many runners told its state."""
+        """Go on where another training told its state.
+
+        Of one with more runners some states are left out, beside one with fewer some begin anew.
+        What was being sampled is then sampled again, and as an iteration has another number of
+        steps, those that were done count for more or fewer.
+        """
+        before = replace(self.setup, runners=runners_before(state, self.setup.runners))
         learner = _below(state, "learner")
+        done = int(learner["iteration"]) * before.samples
+        learner["iteration"] = np.array(math.ceil(done / self.setup.samples))
         self.algorithm.learner_group.foreach_learner(lambda one: one.restore_training(learner))
-        runners = range(max(1, self.runners))
+        runners = range(max(1, self.setup.runners))
         states = [_below(state, f"runner{i}") for i in runners]
 
         def give(runner: BatchRunner) -> None:
@@ -316,6 +349,8 @@ class Trainer:
                 runner.sampler.restore(told)
 
         self.each_runner(give)
+        if before.runners != self.setup.runners:
+            return
         kept = [Fragment(**arrays) for i in runners if (arrays := _below(state, f"coming{i}"))]
         if kept:
             self.algorithm.bring(kept)
@@ -333,7 +368,16 @@ class Trainer:
         """What the runners that sample answer, in their order."""
         self.algorithm.settle()
         group = self.algorithm.env_runner_group
-        return list(group.foreach_env_runner(action, local_env_runner=not self.runners))
+        here = not self.setup.runners
+        told = group.foreach_env_runner(
+            action, local_env_runner=here, timeout_seconds=LEAST_SECONDS
+        )
+        return list(told)
+
+
+def runners_before(state: State, now: int) -> int:
+    """Runners of the training that told a state; as many as now, where it did not tell."""
+    return int(state.get("runners", now))
 
 
 def _place(runner: BatchRunner) -> int:

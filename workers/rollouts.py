@@ -16,6 +16,7 @@ from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED, NUM_ENV_STEPS_SAMPLED_LIFETIME
 
+from pup.errors import InputError
 from pup.policy.network import ProjectedPolicy, draw
 
 Array = NDArray[np.float32]
@@ -239,7 +240,12 @@ class _Now:
 
 
 class BatchRunner(EnvRunner, Checkpointable):
-    """A runner whose `sample` gives one Fragment."""
+    """A runner whose `sample` gives one Fragment.
+
+    Attributes:
+      trouble: why it cannot, where it could not make its task: RLlib takes a remote runner whose
+        constructor raises for a lost one, and tells nobody why.
+    """
 
     def __init__(self, *, config: Any, **told: Any) -> None:
         super().__init__(config=config, **told)
@@ -252,7 +258,15 @@ class BatchRunner(EnvRunner, Checkpointable):
         here = self.worker_index > 0 or self.config.num_env_runners == 0
         if here:
             torch.set_num_threads(1)  # its simulations have the cores
-        self.sampler = Sampler(self.sampling, self.worker_index) if here else None
+        self.sampler: Sampler | None = None
+        self.trouble = ""
+        try:
+            self.sampler = Sampler(self.sampling, self.worker_index) if here else None
+        except Exception as error:
+            if not self.worker_index:
+                raise
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            self.trouble = f"{kind}{error}"
 
     def sample(self, **_: Any) -> list[Fragment]:
         """See EnvRunner."""
