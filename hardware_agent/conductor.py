@@ -7,6 +7,7 @@ feet → settled → written down as running → walking → ended → distance 
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from enum import StrEnum
 from typing import Any
 
@@ -14,10 +15,10 @@ import numpy as np
 
 from hardware_agent.activities import Ended, Posed, Settled, TrialEvent, Walked
 from hardware_agent.config import Settings
-from hardware_agent.distance import Distance, DistanceError
+from hardware_agent.distance import Distance, DistanceError, check_typed
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
-from hardware_agent.recordings import Kept, Recordings
+from hardware_agent.recordings import Recordings
 from hardware_agent.rollout import Rollout
 from hardware_agent.trials import End, TrialBook
 from pup.errors import InputError
@@ -31,7 +32,6 @@ from pup.wire import (
     Finished,
     Outcome,
     Sample,
-    farthest,
 )
 
 SAMPLES = 0.2  # s between two samples
@@ -87,9 +87,12 @@ class Conductor:
         self._direction = "forward"
         self._armed = False
         self._future: Future[Any] | None = None
-        self._ended: Ended | None = None
-        self._recording: Kept | None = None
+        self._end: End | None = None  # of a motion that is over
+        self._doubted: float | None = None
         self._sampled = 0.0
+        if (left := book.unmeasured) is not None:  # it walked before the agent was started anew
+            self._assign, self._end = left
+            self._ask()
 
     @property
     def trial(self) -> str | None:
@@ -125,23 +128,20 @@ class Conductor:
         """Somebody has measured how far the robot came, in m.
 
         Args:
-          distance: m.
+          distance: m; one that is hard to believe counts where it is told twice in a row.
           trial: that was measured; None for whichever it is that asks.
 
         Raises:
-          InputError: nobody was asked, or no robot comes so far.
+          InputError: nobody was asked, or the distance is not believed.
         """
         if self.stage is not Stage.MEASURING or self._future is not None or self._assign is None:
             raise InputError("no distance is asked for now")
         if trial not in (None, self._assign.trial):
             raise InputError(f"the distance of {self._assign.trial} is asked for, not of {trial}")
-        most = farthest(self._assign.horizon)
-        if not abs(distance) <= most:
-            raise InputError(
-                f"{distance:g} m in {self._assign.horizon:g} s cannot be ({most:g} m at most); "
-                "was it in metres? Tell it again"
-            )
-        self._finish(Outcome.SUCCEEDED, self._reason, distance)
+        assert self._end is not None
+        sure, self._doubted = distance == self._doubted, distance
+        check_typed(distance, self._end.time or 0.0, self._assign.horizon, sure)
+        self._finish(Outcome.SUCCEEDED, self._end.reason, distance)
 
     def cancelled(self, cancel: Cancel) -> None:
         """The gateway takes a trial back."""
@@ -271,17 +271,22 @@ class Conductor:
 
     def _over(self, event: Ended) -> None:
         """The motion has ended; the distance is taken at once, before the robot is touched."""
-        self._ended, self._reason, self._future = event, event.reason, None
-        if event.outcome is Outcome.SUCCEEDED:
-            self.stage = Stage.MEASURING
-            if self._distance.asks:
-                self.waiting = "distance"
-            else:
-                self._future = self._hands.submit(self._distance.end)
+        self._future = None
+        ended = event.outcome is Outcome.SUCCEEDED
+        if ended and not self._distance.asks:
+            self.stage, self._future = Stage.MEASURING, self._hands.submit(self._distance.end)
         rows = np.array([row.values for row in event.rollout.rows])
-        self._recording = self._recordings.keep(event.assign, rows, event.reason)
-        if event.outcome is not Outcome.SUCCEEDED:
+        kept = self._recordings.keep(event.assign, rows, event.reason) or (None, None)
+        self._end = End(event.outcome, event.reason, None, event.time, *kept)
+        if not ended:
             self._finish(event.outcome, event.reason)
+        elif self._distance.asks:
+            self._book.walked(event.assign, self._end)  # before anybody goes for the tape
+            self._ask()
+
+    def _ask(self) -> None:
+        """Have somebody tell how far the robot came."""
+        self.stage, self.waiting = Stage.MEASURING, "distance"
 
     def _collect(self, future: Future[Any]) -> None:
         self._future = None
@@ -297,13 +302,13 @@ class Conductor:
             self.stage = Stage.SETTLING
             self._motion.placed(self._assign, cold=self._settings.distance.renew)
         elif self.stage is Stage.MEASURING:
-            self._finish(Outcome.SUCCEEDED, self._reason, told)
+            assert self._end is not None
+            self._finish(Outcome.SUCCEEDED, self._end.reason, told)
 
     def _finish(self, outcome: Outcome, reason: str, distance: float | None = None) -> None:
         assert self._assign is not None
-        recording, digest = self._recording or (None, None)
-        walked = self._ended.time if self._ended else None
-        end = End(outcome, reason, distance, walked, recording, digest)
+        walked = self._end or End(outcome, reason)
+        end = replace(walked, outcome=outcome, reason=reason, distance=distance)
         finished = self._book.finish(self._assign, end)
         self._send(*self.told(finished))
         self._reset()
@@ -311,8 +316,8 @@ class Conductor:
 
     def _reset(self) -> None:
         self.stage, self.waiting = Stage.NONE, ""
-        self._assign = self._rollout = self._ended = self._recording = self._future = None
-        self._armed = False
+        self._assign = self._rollout = self._end = self._future = None
+        self._armed, self._doubted = False, None
 
     def _mine(self, current: Assign | None) -> bool:
         """Whether the book's trial is still the one at work here."""

@@ -13,10 +13,13 @@ from typing import Any, Protocol
 from hardware_agent.config import DistanceSettings
 from hardware_agent.control import Unreachable, say
 from pup.errors import InputError
-from pup.wire import Assign, without_mark
+from pup.wire import FASTEST, Assign, farthest, without_mark
 
 AXES = {"forward": (1.0, 0.0), "backward": (-1.0, 0.0), "sideways": (0.0, -1.0)}
 """Directions of a walk in the frame of the start: x forward, y left."""
+BRISK = 1.0
+"""Speed above which whoever typed a distance is asked for it again, m/s: a biped of the OP2's size
+has to run for it, and 30 cm typed as 30 is far above."""
 
 
 class DistanceError(Exception):
@@ -44,6 +47,28 @@ def distance_of(settings: DistanceSettings) -> Distance:
     if settings.kind == "hook":
         return Hook(settings)
     return Virtual(settings) if settings.kind == "virtual" else Operator()
+
+
+def check_typed(distance: float, walked: float, horizon: float, sure: bool) -> None:
+    """Refuse a distance that somebody mistyped, in centimetres say.
+
+    Args:
+      distance: that was typed, m.
+      walked: time until the fall or the end, s.
+      horizon: longest walk, s.
+      sure: whether it was typed before, and doubted.
+
+    Raises:
+      InputError: no robot comes so far, or hardly one.
+    """
+    most = farthest(horizon, walked)
+    told = f"{distance:g} m in a walk of {walked:.1f} s"
+    if not abs(distance) <= most:
+        raise InputError(f"{told} cannot be ({most:g} m at most); tell it in metres")
+    if abs(distance) > most * BRISK / FASTEST and not sure:
+        raise InputError(
+            f"{told} is far: tell it in metres (30 cm are 0.3), or the same again if it is right"
+        )
 
 
 class Operator:

@@ -25,6 +25,7 @@ from pup.wire import (
 )
 
 RESTARTED = "agent restarted"
+NAMESAKE = "this agent knows another trial by this name; attempt it again and it walks"
 Key = tuple[str, int]
 """Trial and attempt."""
 
@@ -35,33 +36,16 @@ class Event(StrEnum):
     Attributes:
       ACCEPTED: a trial was taken on, or its fence grew.
       RUNNING: its motion is about to begin.
+      WALKED: its motion is over, and somebody is asked for its distance.
       FINISHED: it is over.
       ACKNOWLEDGED: the gateway has stored its end.
     """
 
     ACCEPTED = "accepted"
     RUNNING = "running"
+    WALKED = "walked"
     FINISHED = "finished"
     ACKNOWLEDGED = "acknowledged"
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A trial.
-
-    Attributes:
-      fence: newest that was seen.
-      assign: what to do; None where only a cancellation came.
-      running: whether its motion has begun.
-      finished: how it ended.
-      acknowledged: whether the gateway knows.
-    """
-
-    fence: int
-    assign: Assign | None = None
-    running: bool = False
-    finished: Finished | None = None
-    acknowledged: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,10 +69,32 @@ class End:
     digest: str | None = None
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A trial.
+
+    Attributes:
+      fence: newest that was seen.
+      assign: what to do; None where only a cancellation came.
+      running: whether its motion has begun.
+      walked: how its motion ended, where somebody was asked for its distance.
+      finished: how it ended.
+      acknowledged: whether the gateway knows.
+    """
+
+    fence: int
+    assign: Assign | None = None
+    running: bool = False
+    walked: End | None = None
+    finished: Finished | None = None
+    acknowledged: bool = False
+
+
 class TrialBook:
     """All trials of a journal.
 
-    A motion that was under way when the journal was written last is over: it becomes aborted.
+    A motion that was under way when the journal was written last is over: it becomes aborted, but
+    where it had ended and only its distance was awaited; that can still be measured.
 
     Args:
       journal: where they stand.
@@ -101,7 +107,7 @@ class TrialBook:
         for entry in journal.entries:
             self._replay(entry)
         for key, trial in list(self._trials.items()):
-            if trial.running and trial.finished is None:
+            if trial.running and trial.finished is None and trial.walked is None:
                 known = salvage and trial.assign and salvage(trial.assign)
                 self._finish(key, known or End(Outcome.ABORTED, RESTARTED))
             elif trial.assign is None and trial.finished is None:
@@ -121,6 +127,14 @@ class TrialBook:
         return any(t.running and t.finished is None for t in self._trials.values())
 
     @property
+    def unmeasured(self) -> tuple[Assign, End] | None:
+        """The trial whose motion is over and whose distance is awaited, and how that ended."""
+        for trial in self._trials.values():
+            if trial.finished is None and trial.assign is not None and trial.walked is not None:
+                return trial.assign, trial.walked
+        return None
+
+    @property
     def owed(self) -> list[Finished]:
         """Ends that the gateway has not acknowledged."""
         return [t.finished for t in self._trials.values() if t.finished and not t.acknowledged]
@@ -137,8 +151,12 @@ class TrialBook:
         """A trial was handed out to this agent; returns what to answer.
 
         One that is known is never run again: where it stands is told anew. A newer fence is taken
-        over, an older one is from a gateway that has been replaced, and gets no answer.
+        over, an older one is from a gateway that has been replaced, and gets no answer. A gateway
+        whose database was restored may call another trial by a name that is known: what was walked
+        then is no answer to it, whatever its fence.
         """
+        if namesakes := self._namesakes(assign):
+            return [self._refused(assign, namesakes)]
         key = (assign.trial, assign.attempt)
         known = self._trials.get(key)
         if known is None:
@@ -191,6 +209,12 @@ class TrialBook:
         self._trials[key] = replace(self._trials[key], running=True)
         return Running(*key, self._trials[key].fence)
 
+    def walked(self, assign: Assign, end: End) -> None:
+        """The trial's motion is over and its distance is awaited, after a restart too."""
+        key = (assign.trial, assign.attempt)
+        self._write(Event.WALKED, key, end=asdict(end))
+        self._trials[key] = replace(self._trials[key], walked=end)
+
     def finish(self, assign: Assign, end: End) -> Finished:
         """The trial is over. One that is over already keeps its end."""
         key = (assign.trial, assign.attempt)
@@ -204,6 +228,22 @@ class TrialBook:
     def fence(self, assign: Assign) -> int:
         """The newest fence of a trial."""
         return self._trials[assign.trial, assign.attempt].fence
+
+    def _namesakes(self, assign: Assign) -> list[Key]:
+        """This attempt of the trial and later ones, where they are of something else here."""
+        return [
+            key
+            for key, known in self._trials.items()
+            if key[0] == assign.trial and key[1] >= assign.attempt and _differs(known, assign)
+        ]
+
+    def _refused(self, assign: Assign, namesakes: list[Key]) -> Finished:
+        """The end of a trial whose name is taken; nobody waits any more for what has it."""
+        for key in namesakes:
+            if not self._trials[key].running and self._trials[key].finished is None:
+                self._finish(key, End(Outcome.ABORTED, "another trial has its name"))
+        key = (assign.trial, assign.attempt)
+        return Finished(*key, assign.fence, Outcome.ABORTED, reason=NAMESAKE)
 
     def _free_for(self, assign: Assign) -> bool:
         """Whether a new trial can be taken on; an operator's new attempt replaces the old one."""
@@ -261,12 +301,16 @@ class TrialBook:
         if event is Event.ACCEPTED:
             told = entry["assign"]
             assign = None if told is None else Assign(**(told | {"eta": tuple(told["eta"])}))
-            running = known is not None and known.running
-            self._trials[key] = Trial(entry["fence"], assign, running)
+            known = known or Trial(0)
+            self._trials[key] = replace(known, fence=entry["fence"], assign=assign)
             return
         assert known is not None
         if event is Event.RUNNING:
             self._trials[key] = replace(known, running=True)
+        elif event is Event.WALKED:
+            end = dict(entry["end"])
+            walked = End(**(end | {"outcome": Outcome(end["outcome"])}))
+            self._trials[key] = replace(known, walked=walked)
         elif event is Event.FINISHED:
             told = dict(entry["finished"])
             finished = Finished(**(told | {"state": Outcome(told["state"])}))
@@ -275,6 +319,13 @@ class TrialBook:
             )
         else:
             self._trials[key] = replace(known, acknowledged=True)
+
+
+def _differs(known: Trial, assign: Assign) -> bool:
+    """Whether a trial that is known asks for another walk than one of its name."""
+    told = known.assign
+    asked = (assign.policy, assign.eta, assign.horizon)
+    return told is not None and (told.policy, told.eta, told.horizon) != asked
 
 
 def _refenced(trial: Trial, assign: Assign) -> Trial:

@@ -71,13 +71,14 @@ class Progress(StrEnum):
     INFEASIBLE = "infeasible"
 
 
-def farthest(horizon: float) -> float:
+def farthest(horizon: float, walked: float | None = None) -> float:
     """Distance beyond which a measurement is a mistake, in centimetres say, m.
 
     Args:
       horizon: longest walk, s.
+      walked: how long this one was, s; a robot that falls lands up to a second's way ahead.
     """
-    return FASTEST * horizon
+    return FASTEST * (horizon if walked is None else min(horizon, walked + 1))
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,9 @@ def transfer(verb: argparse.ArgumentParser) -> None:
         study.add_argument(
             name, type=number(*limits, kind), metavar="N" if kind is int else "X", help=told
         )
-    study.add_argument("--agent", metavar="NAME", help="that shall run it; default: any that can")
+    study.add_argument(
+        "--agent", metavar="NAME", help="that shall run it; default: the first that can"
+    )
     study.add_argument(
         "--auto", action="store_true", help="trials need no operator's release at the service"
     )

@@ -47,13 +47,13 @@ def test_the_operator_lets_trials_start_and_tells_distances(tmp_path: Path) -> N
         assert not gateway.of(Armed)
         made.say("arm")
         wait(lambda: made.health()["waiting"] == "distance", 20, made.log)
-        for wrong in ({"distance": 62.0}, {"distance": 0.6, "trial": "b"}):  # cm; another's
+        for wrong in ({"distance": 62.0}, {"distance": 0.3, "trial": "b"}):  # cm; another's
             with pytest.raises(InputError, match=r"cannot be|is asked for"):
                 made.say("distance", **wrong)
-        made.say("distance", distance=0.62)
+        made.say("distance", distance=0.31)
         wait(lambda: bool(gateway.of(Finished)), 20, made.log)
         (ended,) = {f.distance for f in gateway.of(Finished)}
-        assert ended == 0.62
+        assert ended == 0.31
         gateway.send(assign(policy, "b"))
         wait(lambda: made.health()["waiting"] == "arm", 20, made.log)
         made.say("skip")
@@ -91,7 +91,9 @@ def test_keys_stop_while_a_distance_is_typed_and_so_does_a_terminal_that_is_lost
         wait(lambda: made.health()["waiting"] == "distance", 40, made.log)
         os.write(keys, b"0.7\x7f6 ")
         made.until("stopped")
-        os.write(keys, b"2\r")
+        os.write(keys, b"2\r")  # 0.62 m in 0.4 s: is that so?
+        assert any(b"0.62 m in a walk of 0.4 s is far" in line for line in printed)
+        os.write(keys, b"0.62\r")
         wait(lambda: bool(gateway.of(Finished)), 20, made.log)
         assert gateway.of(Finished)[0].distance == 0.62
         made.say("enable")

@@ -4,7 +4,7 @@ import json
 import os
 import random
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,6 +29,8 @@ from pup.wire import (
     decode,
     encode,
 )
+
+FELL = End(Outcome.SUCCEEDED, "fell", None, 3.0, "recording", "0" * 64)
 
 
 def assign(trial: str = "t", attempt: int = 1, fence: int = 1) -> Assign:
@@ -104,7 +106,8 @@ class World:
         """Power is back: everything but the journal is gone."""
         self.journal = Fragile(self.folder / "journal")
         self.book = TrialBook(self.journal)
-        self.moving: Assign | None = None
+        left = self.book.unmeasured
+        self.moving: Assign | None = left and left[0]
 
     def agent(self, body: Body) -> None:
         """The agent gets a message."""
@@ -132,11 +135,15 @@ class World:
         self.moved[current.trial, current.attempt] += 1
         self.moving = current
 
+    def over(self) -> None:
+        """It has ended, and somebody goes for the tape."""
+        if self.moving is not None and self.book.unmeasured is None:
+            self.book.walked(self.moving, FELL)
+
     def stand(self) -> None:
-        """It has ended."""
+        """It has ended, and how far it came is known."""
         if self.moving is not None:
-            end = End(Outcome.SUCCEEDED, "fell", 0.5, 3.0)
-            self.outbox.append(self.book.finish(self.moving, end))
+            self.outbox.append(self.book.finish(self.moving, replace(FELL, distance=0.5)))
             self.moving = None
 
     def gateway(self, body: Body) -> None:
@@ -158,6 +165,7 @@ WEIGHTS = {
     "drop": 5.0,
     "repeat": 2.0,
     "move": 3.0,
+    "over": 1.0,
     "stand": 2.0,
     "resend": 1.0,
     "restart": 0.4,
@@ -207,7 +215,8 @@ def _do(world: World, kind: str, rng: random.Random) -> None:
     elif kind == "cut":
         world.journal.cut = rng.randrange(4)
     else:
-        {"move": world.move, "stand": world.stand, "restart": world.restart}[kind]()
+        does = {"move": world.move, "over": world.over, "stand": world.stand}
+        (does | {"restart": world.restart})[kind]()
 
 
 def _pass(world: World, kind: str, up: bool, which: int) -> None:
@@ -254,6 +263,21 @@ def test_a_motion_that_the_power_cut_is_told_as_aborted(tmp_path: Path) -> None:
     (owed,) = again.owed
     assert (owed.state, owed.reason) == (Outcome.ABORTED, RESTARTED)
     assert again.assigned(assign()) == [owed]
+
+
+def test_a_walk_that_is_over_waits_for_its_distance_after_a_restart_too(tmp_path: Path) -> None:
+    first = book(tmp_path)
+    first.assigned(assign())
+    first.begin(assign())
+    first.walked(assign(), FELL)
+    again = book(tmp_path)
+    assert again.unmeasured == (assign(), FELL) and again.running and not again.owed
+    assert again.assigned(assign(fence=2)) == [Running("t", 1, 2)], "not walked again"
+    third = book(tmp_path)
+    assert third.unmeasured == (assign(fence=2), FELL)
+    told = third.finish(assign(fence=2), replace(FELL, distance=0.4))
+    assert (told.state, told.distance, told.fence) == (Outcome.SUCCEEDED, 0.4, 2)
+    assert book(tmp_path).unmeasured is None
 
 
 def test_a_trial_that_was_only_accepted_goes_on_after_a_restart(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from dataclasses import asdict
 
 import pytest
 
@@ -272,42 +271,6 @@ def test_a_page_does_not_wait_for_a_slow_process_and_many_pages_ask_for_one():
         assert (await made.soon(study, None, 0.05))["walks"] == 9
 
     asyncio.run(asyncio.wait_for(live(), 120))
-
-
-def test_a_silent_agent_loses_the_trial_and_its_late_result_never_counts(tmp_path, quiet):
-    async def live():
-        store = Store(f"sqlite:///{tmp_path / 'late.db'}")
-        conductor = Conductor(store, InProcess(), Metrics())
-        sent = []
-        conductor.courier.send = lambda agent, body: sent.append(body)
-        view = conductor.agents["darwin-1"] = AgentView("darwin-1")
-        view.greet(Hello("darwin-1", "darwin_op2", "1", (Policy("walk", POLICY),)))
-        view.beat(Heartbeat("darwin-1", AgentState.ENABLED))
-        view.heard = asyncio.get_running_loop().time()
-        settings = StudySettings(
-            **asdict(SETTINGS) | {"lease": 1.0, "failures": 1, "gate": Gate.AUTO}
-        )
-        await conductor.create("s", settings, None, "test")
-        await conductor._look("s")
-        await conductor._look("s")
-        (assign,) = [b for b in sent if isinstance(b, Assign)]
-        conductor._heard["s"] -= 2.0
-        await conductor._look("s")
-        study = conductor.studies["s"]
-        assert study.trial(1).state == "lost" and study.state == "paused"
-        late = Finished(assign.trial, assign.attempt, assign.fence, Outcome.SUCCEEDED, 0.9, 1.0)
-        for _ in range(2):
-            assert await conductor.finished("darwin-1", late) == "late"
-        assert conductor.studies["s"].trial(1).state == "lost" and not conductor.studies["s"].told
-        events = await store.events("s", 0, 100)
-        assert [e["detail"]["distance"] for e in events if e["kind"] == "late"] == [0.9] * 2
-        stranger = Finished("nobody/7", 1, 1, Outcome.SUCCEEDED, 0.9, 1.0)
-        assert await conductor.finished("darwin-1", stranger) == "unknown"
-        await conductor.reported("darwin-1", Accepted(assign.trial, 1, assign.fence))
-        assert sent[-1].trial == assign.trial and type(sent[-1]).__name__ == "Cancel"
-        store.close()
-
-    asyncio.run(live())
 
 
 def test_the_store_writes_a_change_whole_or_not_at_all(tmp_path):

@@ -59,15 +59,65 @@ def test_the_same_question_has_the_same_answer_to_the_last_bit():
     assert suggest(search(eta, distance, seed=1), 13).eta != first.eta
 
 
+def initials(count, distance=0.0, **more):
+    """The first etas of a search whose walks all come as far."""
+    drawn = np.zeros((0, 3))
+    for number in range(1, count + 1):
+        asked = replace(search(drawn, np.full(number - 1, distance)), initial=count, **more)
+        told = suggest(asked, number)
+        assert told.purpose is Purpose.INITIAL
+        drawn = np.vstack([drawn, told.eta])
+    return drawn
+
+
 def test_the_first_trials_are_the_middle_and_uniform_and_do_not_depend_on_what_walked():
-    for number in range(1, 6):
-        a = suggest(search(np.zeros((number - 1, 3)), np.zeros(number - 1)), number)
-        b = suggest(search(np.ones((number - 1, 3)), np.ones(number - 1)), number)
-        assert a.eta == b.eta and a.purpose is Purpose.INITIAL
-    drawn = np.array([suggest(search([], []), n).eta for n in range(1, 257)])
+    assert (initials(5) == initials(5, distance=1.0)).all()
+    drawn = initials(256)
     assert (drawn[0] == 0).all()
     assert np.abs(drawn.mean(axis=0)).max() < 0.02  # a Sobol sequence fills the box evenly
     assert np.abs(drawn.std(axis=0) - 1 / np.sqrt(3)).max() < 0.02
+
+
+def test_a_first_point_that_gave_no_result_is_offered_once_more():
+    """Whatever the number of the trial; what goes wrong twice, goes wrong by its eta."""
+    points = [tuple(eta) for eta in initials(3)]
+    asked = replace(search([], []), fruitless=(points[0],), avoided=(points[0],))
+    again = suggest(asked, 2)
+    assert again.eta == points[0] and again.why == "the middle of the box"
+    assert suggest(replace(asked, fruitless=(points[0],) * 2), 3).eta == points[1]
+    walked = replace(search(points[1:2], [0.3]), fruitless=(points[0],))
+    assert suggest(walked, 7).eta == points[0], "others were walked meanwhile"
+    assert suggest(search(points[:1], [0.3]), 9).eta == points[1], "trials in between were aborted"
+
+
+def test_an_eta_that_gave_no_result_is_not_asked_for_at_once_again():
+    """It overloads the robot, say: whoever resumes wants another one, and the same each time."""
+    rng = np.random.default_rng(3)
+    eta = rng.uniform(-1, 1, (12, 3))
+    asked = search(eta, landscapes.Robot.draw(0).walk(eta, rng))
+    first = suggest(asked, 13)
+    near = [suggest(asked, number).eta for number in (14, 15)]
+    assert min(np.linalg.norm(np.subtract(x, first.eta)) for x in near) < 0.02, "else it would"
+    fruitless = (first.eta,)
+    for number in (14, 15, 16):
+        avoiding = replace(asked, fruitless=fruitless, avoided=fruitless)
+        away, same = (suggest(avoiding, number) for _ in range(2))
+        assert away.eta == same.eta and away.digest == same.digest != asked.digest
+        apart = [np.linalg.norm(np.subtract(away.eta, x)) for x in fruitless]
+        assert min(apart) > 0.1 and "gave no result" in away.why
+        fruitless = (*fruitless, away.eta)
+    after = replace(asked, fruitless=fruitless)
+    assert suggest(after, 17).eta == suggest(asked, 17).eta, "another walk was told since"
+    alike = replace(asked, fruitless=fruitless, avoided=(tuple(eta[0]),))
+    assert suggest(alike, 13).gain == pytest.approx(first.gain, rel=0.1), "of walks alone"
+
+
+def test_before_the_first_walk_too():
+    asked = search([], [], simulated=simulate())
+    first = suggest(asked, 1)
+    away = suggest(replace(asked, fruitless=(first.eta,), avoided=(first.eta,)), 2)
+    assert np.linalg.norm(np.subtract(away.eta, first.eta)) > 0.2
+    assert away.is_worth(0.5) and away.gain is None
 
 
 @settings(max_examples=6)

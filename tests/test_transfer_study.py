@@ -32,7 +32,7 @@ AFTER = {
     S.ARMED: {S.RUNNING, S.SUCCEEDED, S.ABORTED, S.INFEASIBLE, S.LOST},
     S.RUNNING: {S.SUCCEEDED, S.ABORTED, S.INFEASIBLE, S.LOST},
     S.ABORTED: {S.REQUESTED},
-    S.LOST: {S.REQUESTED},
+    S.LOST: {S.REQUESTED, S.SUCCEEDED, S.ABORTED, S.INFEASIBLE},  # a result that comes late
     S.SUCCEEDED: {S.ABORTED},  # made void
     S.INFEASIBLE: {S.ABORTED},
 }
@@ -50,6 +50,7 @@ results = st.builds(
     Result,
     st.sampled_from([S.SUCCEEDED, S.ABORTED, S.INFEASIBLE]),
     st.none() | st.floats(-1, 2),
+    st.none() | st.floats(0, 15),
 )
 events = st.one_of(
     st.tuples(st.just("release")),
@@ -83,7 +84,7 @@ def test_no_history_breaks_a_rule(history):
             fences.append(trial.fence)
         if name == "finish" and verdict is Verdict.COUNTED:
             ticket = given_[0]
-            assert before.state in HANDED_OUT
+            assert before.state in (*HANDED_OUT, S.LOST)
             assert ticket == Ticket(before.attempt, before.fence, before.agent)
             counted.append((trial.attempt, trial.fence))
         assert trial.attempt == before.attempt or name == "retry", "only an operator retries"
@@ -123,11 +124,16 @@ def test_a_walk_that_was_cancelled_does_not_count():
     assert fallen.state is S.INFEASIBLE
 
 
-def test_a_result_after_the_lease_is_late():
+def test_a_result_after_the_lease_counts_once_while_nobody_has_it_retried():
+    """The walk was as good as any; a retry has another attempt, so nothing can count twice."""
     trial, ticket = handed_out()
     trial = trial.expire()
+    assert trial.report(ticket, S.RUNNING) == (trial, Verdict.LATE)
     after, verdict = trial.finish(ticket, Result(S.SUCCEEDED, 0.7), 15.0)
-    assert verdict is Verdict.LATE and after.state is S.LOST
+    assert verdict is Verdict.COUNTED and after.state is S.SUCCEEDED
+    assert after.finish(ticket, Result(S.SUCCEEDED, 0.7), 15.0) == (after, Verdict.REPEATED)
+    with pytest.raises(TrialError, match="only aborted or lost"):
+        after.retry(2)
 
 
 def test_a_result_of_an_earlier_attempt_is_late_whatever_the_newer_one_does():
@@ -151,6 +157,18 @@ def test_a_success_without_a_distance_that_can_be_is_no_data_point(distance):
     trial, ticket = handed_out()
     trial, _ = trial.finish(ticket, Result(S.SUCCEEDED, distance), 15.0)
     assert trial.state is S.ABORTED and "distance" in trial.result.reason
+
+
+def test_a_distance_is_believed_for_the_time_that_was_walked():
+    """30 cm typed as 30, for a fall after 1.2 s, must not win the study."""
+    trial, ticket = handed_out()
+    typed, _ = trial.finish(ticket, Result(S.SUCCEEDED, 30.0, 1.2), 15.0)
+    assert typed.state is S.ABORTED and "30.0 m in 1.2 s" in typed.result.reason
+    for distance, seconds in ((30.0, 15.0), (10.9, 1.2), (30.0, None)):
+        walked, _ = trial.finish(ticket, Result(S.SUCCEEDED, distance, seconds), 15.0)
+        assert walked.state is S.SUCCEEDED
+    over, _ = trial.finish(ticket, Result(S.SUCCEEDED, 76.0, 1000.0), 15.0)
+    assert over.state is S.ABORTED, "no walk is longer than the horizon"
 
 
 def test_an_operator_retries_once_however_often_asked():
@@ -270,8 +288,60 @@ def test_a_walk_that_shall_not_count_is_void_until_an_eta_was_chosen_by_it():
     assert again.trial(1).attempt == 2 and again.state is StudyState.ACTIVE
     with pytest.raises(TrialError, match="nothing to make void"):
         orders.void(again, 1, "once more")
-    with pytest.raises(TrialError, match="has chosen by trial"):
-        orders.void(replace(study, chosen=(0.0,) * 3), 1, "too late")
+
+
+@pytest.mark.parametrize("state", [StudyState.ACTIVE, StudyState.DONE])
+def test_a_slip_that_is_seen_after_the_choice_costs_the_choice_alone(state):
+    """The choice follows the last walk within a second; with no repeats the study's end does."""
+    study = replace(walked(*[S.SUCCEEDED] * 25), chosen=(0.0,) * 3, state=state)
+    asked = Trial("s", 26, study.chosen, Purpose.REPEAT)
+    void = orders.void(study.with_trial(asked), 25, "30 for 0.3")
+    assert void.chosen is None and void.state is StudyState.PAUSED and "30 for 0.3" in void.reason
+    assert [t.number for t in void.told] == list(range(1, 25)), "the others count"
+    assert void.open is None and "anew" in void.trial(26).result.reason
+    assert isinstance(next_step(orders.resume(void)), Suggest)
+    again = orders.retry(void, 25, 2)
+    trial, _ = (
+        again.trial(25).assign("a", 99).finish(Ticket(2, 99, "a"), Result(S.SUCCEEDED, 0.3), 15.0)
+    )
+    assert isinstance(next_step(again.with_trial(trial)), Choose)
+
+
+def test_a_walk_after_the_choice_is_made_void_without_another_choice():
+    study = replace(walked(*[S.SUCCEEDED] * 25), chosen=(0.0,) * 3)
+    for agent, purpose in (("a", Purpose.REPEAT), (None, Purpose.COMPARE)):
+        trial = Trial("s", len(study.trials) + 1, study.chosen, purpose).release()
+        study = study.with_trial(trial.assign("a", 90) if agent else trial)
+        if agent:
+            trial, _ = study.trial(26).finish(Ticket(1, 90, "a"), Result(S.SUCCEEDED, 9.0), 15.0)
+            study = study.with_trial(trial)
+    void = orders.void(study, 26, "mistyped")
+    assert void.chosen == study.chosen and void.open == study.open
+    handed = study.with_trial(study.trial(27).assign("a", 91))
+    assert orders.void(handed, 25, "mistyped").open == handed.open, "an agent has it"
+
+
+def test_who_began_a_study_goes_on_with_it():
+    """Walks of two robots in one process would tell of neither."""
+    study = Study("s", SETTINGS)
+    assert study.agent is None
+    trial = fresh().release().assign("a", 1)
+    moved, _ = trial.finish(Ticket(1, 1, "a"), Result(S.ABORTED, None, 3.0, "tripped"), 15.0)
+    stood, _ = trial.finish(Ticket(1, 1, "a"), Result(S.ABORTED, reason="too warm"), 15.0)
+    for told, agent in ((trial, "a"), (moved, "a"), (trial.expire(), "a"), (stood, None)):
+        assert study.with_trial(told).agent == agent
+        if told is not trial:
+            retried = orders.retry(study.with_trial(told), 1, 2)
+            assert retried.agent == agent
+            ticket = Ticket(2, 1, "a")
+            assert retried.trial(1).finish(ticket, Result(S.ABORTED), 15.0)[1] is Verdict.UNKNOWN
+    assert replace(study, settings=replace(SETTINGS, agent="b")).with_trial(moved).agent == "b"
+
+
+def test_a_stop_pauses_the_study_that_its_robot_has_begun():
+    study = walked(S.SUCCEEDED)
+    assert orders.halt(study, "a", "smoke").state is StudyState.PAUSED
+    assert orders.halt(study, "b", "smoke") == study
 
 
 def test_a_study_that_no_robot_can_walk_pauses():

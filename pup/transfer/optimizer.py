@@ -3,8 +3,9 @@
 The middle of the box and a few uniform trials, or simulated rollouts in their place, then each
 trial where noisy expected improvement on the Gaussian process is largest, as long as it is worth a
 walk; at the end the tried eta with the largest posterior mean, so that one lucky walk does not
-decide. Everything is a function of the data, the number of the trial and the seed: whoever is
-stopped and asks again is told the same.
+decide. An eta whose trial gave no result, because it overloads the robot, say, is not told to the
+process; the next one is sought away from it. Everything is a function of the data, the number of
+the trial and the seed: whoever is stopped and asks again is told the same.
 """
 
 import hashlib
@@ -38,6 +39,8 @@ CONFIRMED = 0.12
 fall one walks far once and falls the next time, which one walk of each does not tell."""
 FEWEST = 4
 """Walks before which no search is over: distances that are alike may be so by chance."""
+OFFERED = 2
+"""Trials without a result after which an initial point is left out: one may be an accident."""
 SAMPLES = 64
 """Draws of the process that expected improvement is averaged over."""
 
@@ -56,6 +59,8 @@ class Search:
       simulated: rollouts to start from, or None.
       feasible: which walks were, shape (n,); None for all. The others are never chosen.
       trials: walks that there will be; None where that is not known.
+      fruitless: etas of the trials that gave no result.
+      avoided: of them, those since the last walk.
     """
 
     lower: Eta
@@ -67,6 +72,8 @@ class Search:
     simulated: Simulated | None = None
     feasible: NDArray[np.bool_] | None = None
     trials: int | None = None
+    fruitless: tuple[Eta, ...] = ()
+    avoided: tuple[Eta, ...] = ()
 
     def __post_init__(self) -> None:
         if self.eta.shape != (len(self.distance), len(self.lower)):
@@ -78,13 +85,15 @@ class Search:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the walks: which data a decision was made on."""
-        return hashlib.sha256(self.eta.tobytes() + self.distance.tobytes()).hexdigest()
+        """SHA-256 of the walks and of what gave none: which data a decision was made on."""
+        without = np.array([*self.fruitless, *self.avoided], dtype=float)
+        data = (self.eta, self.distance, without)
+        return hashlib.sha256(b"".join(x.tobytes() for x in data)).hexdigest()
 
     @property
     def told(self) -> Told:
         """The walks, on the unit cube."""
-        return Told(self._unit(self.eta), self.distance)
+        return Told(self.unit(self.eta), self.distance)
 
     @property
     def prior(self) -> Landscapes | None:
@@ -118,9 +127,10 @@ class Search:
         low, high = np.array(self.lower), np.array(self.upper)
         return np.asarray(np.clip(low + unit * (high - low), low, high))
 
-    def _unit(self, eta: Array) -> Array:
+    def unit(self, eta: Array | tuple[Eta, ...]) -> Array:
+        """Etas of the unit cube from those of the box, shape (n, n_eta)."""
         low, high = np.array(self.lower), np.array(self.upper)
-        return np.asarray((eta - low) / (high - low))
+        return np.asarray((np.reshape(eta, (-1, len(low))) - low) / (high - low))
 
 
 @dataclass(frozen=True)
@@ -175,11 +185,12 @@ def suggest(search: Search, number: int) -> Decision:
     """
     began = time.perf_counter()
     if search.simulated is None and len(search.distance) < search.initial:
-        eta = search.real(_initial(len(search.lower), search.seed, number)[None])[0]
+        place, unit = _next_initial(search)
+        uniform = f"uniform, before {search.initial} walks"
         return Decision(
-            tuple(eta.tolist()),
+            tuple(search.real(unit[None])[0].tolist()),
             Purpose.INITIAL,
-            "the middle of the box" if number == 1 else f"uniform, before {search.initial} walks",
+            uniform if place else "the middle of the box",
             len(search.distance),
             search.digest,
             seconds=time.perf_counter() - began,
@@ -190,10 +201,10 @@ def suggest(search: Search, number: int) -> Decision:
         unit = search.best(surrogate)
         why = "the best so far, once more before one is kept"
         return _decision(search, surrogate, unit, Purpose.SEARCH, why, began)
-    if len(search.distance):
-        unit, gain = _improve(surrogate, search.told, rng)
-        best = float(surrogate.predict(search.told.eta)[0].max())
-        why = "largest noisy expected improvement"
+    if len(search.distance) or search.avoided:
+        unit, gain, best = _improve(surrogate, search, rng)
+        away = ", away from what gave no result" if search.avoided else ""
+        why = f"largest noisy expected improvement{away}"
         decision = _decision(search, surrogate, unit, Purpose.SEARCH, why, began)
         return replace(decision, gain=gain, best=best)
     candidates = _candidates(len(search.lower), rng)
@@ -272,30 +283,55 @@ def _decision(
     )
 
 
-def _initial(n_eta: int, seed: int, number: int) -> Array:
+def _next_initial(search: Search) -> tuple[int, Array]:
+    """The first initial point that no walk was told of, and its place, from 0.
+
+    It goes by walks, not by numbers of trials, so that one whose trial gave no result is offered
+    again; after `OFFERED` such trials it is left out.
+    """
+    told, fruitless = search.told.eta, search.unit(search.fruitless)
+    points = _initials(len(search.lower), search.seed, len(told) + len(fruitless) + 1)
+    walked = _same(points, told).any(axis=1)
+    place = int(np.argmin(walked | (_same(points, fruitless).sum(axis=1) >= OFFERED)))
+    return place, points[place]
+
+
+def _initials(n_eta: int, seed: int, count: int) -> Array:
     """The middle, then a scrambled Sobol sequence: uniform, and far from each other."""
-    if number == 1:
-        return np.full(n_eta, 0.5)
-    drawn = qmc.Sobol(n_eta, rng=np.random.default_rng(seed)).random_base2(number.bit_length())
-    return np.asarray(drawn[number - 2])
+    sobol = qmc.Sobol(n_eta, rng=np.random.default_rng(seed))
+    drawn = sobol.random_base2(count.bit_length())
+    return np.vstack([np.full(n_eta, 0.5), drawn])[:count]
+
+
+def _same(points: Array, others: Array) -> NDArray[np.bool_]:
+    """Which points of the unit cube are which of others, shape (n_points, n_others)."""
+    return np.asarray((np.abs(points[:, None] - others[None]) < 1e-9).all(axis=-1))
 
 
 def _candidates(n_eta: int, rng: np.random.Generator) -> Array:
     return np.asarray(qmc.Sobol(n_eta, rng=rng).random(CANDIDATES))
 
 
-def _improve(surrogate: Surrogate, told: Told, rng: np.random.Generator) -> tuple[Array, float]:
-    """Where the logarithm of noisy expected improvement is largest; the improvement there, m."""
-    n_eta = told.eta.shape[1]
+def _improve(
+    surrogate: Surrogate, search: Search, rng: np.random.Generator
+) -> tuple[Array, float | None, float | None]:
+    """Where noisy expected improvement is largest, over what is avoided too.
+
+    Etas to avoid are as if walked, with distances not known yet: whatever is near them improves
+    on them by little. A walk is worth what it gains over those that were made.
+
+    Returns:
+      The eta on the unit cube, the improvement over the best eta walked, and what that one is
+      expected to walk, m; None where there is none.
+    """
+    known = search.told.eta
+    baseline = np.vstack([known, search.unit(search.avoided)])
+    n_eta = known.shape[1]
     torch.manual_seed(int(rng.integers(2**31)))
-    acquisition = qLogNoisyExpectedImprovement(
-        surrogate.model,
-        torch.as_tensor(told.eta),
-        sampler=SobolQMCNormalSampler(torch.Size([SAMPLES]), seed=int(rng.integers(2**31))),
-        prune_baseline=False,
-    )
-    means, _ = surrogate.predict(told.eta)
-    best = told.eta[np.argsort(-means)[:3]]
+    drawn = int(rng.integers(2**31))
+    acquisition = _acquisition(surrogate, baseline, drawn)
+    means, _ = surrogate.predict(baseline)
+    best = baseline[np.argsort(-means)[:3]]
     around = best[rng.integers(len(best), size=NEARBY)] + rng.normal(0, 0.1, (NEARBY, n_eta))
     tried = np.vstack([_candidates(n_eta, rng), np.clip(around, 0, 1)])
     with torch.no_grad():
@@ -310,4 +346,19 @@ def _improve(surrogate: Surrogate, told: Told, rng: np.random.Generator) -> tupl
         batch_initial_conditions=starts,
         options={"maxiter": 25},
     )
-    return found[0].clamp(0, 1).numpy(), surrogate.scale * math.exp(float(value))
+    unit = found[0].clamp(0, 1).numpy()
+    if not len(known):
+        return unit, None, None
+    if search.avoided:
+        value = _acquisition(surrogate, known, drawn)(found).detach()
+    gain = surrogate.scale * math.exp(float(value))
+    return unit, gain, float(surrogate.predict(known)[0].max())
+
+
+def _acquisition(surrogate: Surrogate, baseline: Array, seed: int) -> qLogNoisyExpectedImprovement:
+    return qLogNoisyExpectedImprovement(
+        surrogate.model,
+        torch.as_tensor(baseline),
+        sampler=SobolQMCNormalSampler(torch.Size([SAMPLES]), seed=seed),
+        prune_baseline=False,
+    )

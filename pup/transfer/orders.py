@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from pup.transfer.study import Study, StudyState
-from pup.transfer.trial import HANDED_OUT, TOLD, Trial, TrialError, TrialState
+from pup.transfer.trial import HANDED_OUT, TOLD, Purpose, Trial, TrialError, TrialState
 
 HOPELESS = 3
 """Trials in a row of which none walked, after which an infeasible one pauses a study."""
@@ -27,19 +27,22 @@ def retry(study: Study, number: int, attempt: int) -> Study:
 
 
 def void(study: Study, number: int, reason: str) -> Study:
-    """Let a walk not count after all; it may be retried.
+    """Let a walk not count after all; it may be retried, also in a study that was done.
+
+    An eta that was chosen by it is not chosen any more: the choice follows the last walk at once,
+    and a slip is seen later than that.
 
     Raises:
-      TrialError: it has no result, or an eta was chosen by it.
+      TrialError: it has no result.
     """
-    _not_done(study)
     trial = study.trial(number)
-    if study.chosen is not None and trial in study.searched:
-        raise TrialError(f"study {study.name} has chosen by trial {trial.id}; begin another study")
     voided = trial.void(reason)
     if voided == trial:
         return study
-    return pause(study.with_trial(voided), f"trial {number}: {reason}")
+    if study.chosen is not None and trial in study.searched:
+        study = _search_again(study)
+    opened = replace(study, state=StudyState.ACTIVE)
+    return pause(opened.with_trial(voided), f"trial {number}: {reason}")
 
 
 def pause(study: Study, reason: str) -> Study:
@@ -68,7 +71,7 @@ def halt(study: Study, agent: str, reason: str) -> Study:
         return study
     if study.open and study.open.agent == agent and study.open.state in HANDED_OUT:
         return cancel(study, study.open.number, reason)
-    waits = study.settings.agent == agent and study.state is StudyState.ACTIVE
+    waits = study.agent == agent and study.state is StudyState.ACTIVE
     return pause(study, reason) if waits else study
 
 
@@ -92,6 +95,16 @@ def after_end(study: Study, last: Trial) -> Study:
     why = last.result.reason if last.result else "nothing was heard of it"
     told = f"trial {last.number} was {last.state} ({why}); retry it, or resume without it"
     return replace(study, state=StudyState.PAUSED, reason=told)
+
+
+def _search_again(study: Study) -> Study:
+    """Forget the choice; a walk that it asked for and that no agent has is taken back."""
+    study, asked = replace(study, chosen=None), study.open
+    if asked is None or asked.purpose not in (Purpose.REPEAT, Purpose.COMPARE):
+        return study
+    if asked.state is not TrialState.REQUESTED:
+        return study
+    return study.with_trial(asked.withdraw("eta is chosen anew"))
 
 
 def _not_done(study: Study) -> None:

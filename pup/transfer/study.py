@@ -1,7 +1,6 @@
 """Studies: what a search for the best eta of one robot looks for, and the trials it has made."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -48,7 +47,7 @@ class StudySettings:
       lease: silence after which a trial that was handed out is lost, s.
       failures: trials in a row that end without a result before the study pauses.
       gate: who lets trials go to the robot.
-      agent: that runs them; None for whichever has the policy.
+      agent: that runs them; None for whichever has the policy first.
       warm_start: whether the simulated rollouts given with the study are used.
       seed: of everything random.
     """
@@ -133,6 +132,15 @@ class Study:
         return next((t for t in reversed(self.trials) if t.state in OPEN), None)
 
     @property
+    def agent(self) -> str | None:
+        """Who runs its trials: whom the settings name, else who began one; None for anybody.
+
+        Two robots are two landscapes: a process that hears of both finds the best eta of neither.
+        """
+        begun = (t.agent for t in reversed(self.trials) if t.begun)
+        return self.settings.agent or next(begun, None)
+
+    @property
     def told(self) -> tuple[Trial, ...]:
         """The trials that the Gaussian process hears of, by number."""
         return tuple(t for t in self.trials if t.state in TOLD)
@@ -147,14 +155,17 @@ class Study:
         walked = (n for n, t in enumerate(reversed(self.trials)) if t.state is TrialState.SUCCEEDED)
         return next(walked, len(self.trials))
 
+    @property
+    def fruitless(self) -> tuple[Trial, ...]:
+        """The trials that ended without a result, by number."""
+        return tuple(t for t in self.trials if t.state not in (*TOLD, *OPEN))
+
+    @property
+    def fruitless_since(self) -> tuple[Trial, ...]:
+        """Those of them after the last one that was told."""
+        last = max((t.number for t in self.told), default=0)
+        return tuple(t for t in self.fruitless if t.number > last)
+
     def failures(self) -> int:
         """Trials at the end that gave no result."""
-        return sum(1 for _ in _until_told(reversed(self.trials)))
-
-
-def _until_told(trials: Iterable[Trial]) -> Iterable[Trial]:
-    for trial in trials:
-        if trial.state in TOLD:
-            return
-        if trial.state not in OPEN:
-            yield trial
+        return len(self.fruitless_since)

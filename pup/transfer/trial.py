@@ -10,7 +10,8 @@ one walk twice:
 - a trial is handed out with a fencing token, `fence`, that only grows; reports with another one
   change nothing;
 - a trial that ended stays as it ended, unless an operator makes it void; a result that comes
-  after its lease ran out is late: it is kept and flagged, but never counts;
+  after its lease ran out counts as long as nobody has had the trial retried: another attempt has
+  another number, so that no walk counts twice. After that it is late: kept and flagged;
 - a trial that was aborted or lost is attempted again only when an operator says so.
 """
 
@@ -77,7 +78,8 @@ class Verdict(StrEnum):
     Attributes:
       COUNTED: the trial changed.
       REPEATED: heard before; nothing changes.
-      LATE: of a lease that ended, or of an attempt that is over; kept, never counted.
+      LATE: of an attempt that is over, or a sign of life of a trial that is lost; kept, never
+        counted.
       UNKNOWN: the gateway never handed this out to this agent.
     """
 
@@ -133,7 +135,7 @@ class Trial:
       state: where it is.
       attempt: counts an operator's decisions to run it, from 1.
       fence: of the last handing-out; 0 before the first.
-      agent: that it was handed out to.
+      agent: that it was handed out to; while it waits for another attempt, who began the last.
       released: whether it passed the gate of the study.
       cancelled: whether an operator wants its agent to end it.
       result: how it ended; None while it is open or lost.
@@ -163,6 +165,12 @@ class Trial:
         """Names it on the wire, where an agent may remember one of another gateway."""
         return f"{self.id}.{self.mark}" if self.mark else self.id
 
+    @property
+    def begun(self) -> bool:
+        """Whether its agent may have moved the robot for it."""
+        stood = self.state is S.ABORTED and self.result is not None and self.result.time is None
+        return self.agent is not None and not stood
+
     def release(self) -> "Trial":
         """Let it pass the gate; a second time changes nothing."""
         if self.state in OPEN:
@@ -185,6 +193,8 @@ class Trial:
     def report(self, ticket: Ticket, state: TrialState) -> tuple["Trial", Verdict]:
         """Hear that it is armed or running; what comes out of order moves it forward only."""
         verdict = self._judge(ticket)
+        if self.state is S.LOST and verdict is Verdict.COUNTED:
+            verdict = Verdict.LATE  # that it moved tells nothing of how it ended
         if verdict is not Verdict.COUNTED:
             return self, verdict
         if HANDED_OUT.index(state) <= HANDED_OUT.index(self.state):
@@ -195,7 +205,7 @@ class Trial:
         """Hear how it ended.
 
         A success without a distance that can be is no result of eta, nor is one of a walk that
-        somebody had cancelled.
+        somebody had cancelled. That of a trial which was lost is: its walk was as good as any.
 
         Args:
           ticket: of who tells.
@@ -206,8 +216,8 @@ class Trial:
         if verdict is not Verdict.COUNTED:
             return self, verdict
         far = math.inf if result.distance is None else abs(result.distance)
-        if result.state is S.SUCCEEDED and not far <= farthest(horizon):
-            why = f"no distance that can be was measured: {result.distance}"
+        if result.state is S.SUCCEEDED and not far <= farthest(horizon, result.time):
+            why = f"no distance that can be was measured: {result.distance} m in {result.time} s"
             result = replace(result, state=S.ABORTED, reason=why)
         if result.state is S.SUCCEEDED and self.cancelled:  # it had ended before it was told
             result = replace(result, state=S.ABORTED, reason="cancelled")
@@ -256,15 +266,15 @@ class Trial:
             raise TrialError(
                 f"attempt {attempt} of trial {self.id}; the next is {self.attempt + 1}"
             )
-        fresh = Trial(self.study, self.number, self.eta, self.purpose)
-        return replace(fresh, mark=self.mark, attempt=attempt, fence=self.fence, released=True)
+        agent = self.agent if self.begun else None
+        fresh = replace(self, state=S.REQUESTED, attempt=attempt, released=True, agent=agent)
+        return replace(fresh, cancelled=False, result=None)
 
     def _judge(self, ticket: Ticket) -> Verdict:
         ours = Ticket(self.attempt, self.fence, self.agent or "")
-        if ticket == ours and self.fence:
-            if self.state in HANDED_OUT:
-                return Verdict.COUNTED
-            return Verdict.LATE if self.state is S.LOST else Verdict.REPEATED
+        if ticket == ours and self.fence and self.state is not S.REQUESTED:
+            awaited = self.state in (*HANDED_OUT, S.LOST)
+            return Verdict.COUNTED if awaited else Verdict.REPEATED
         known = 0 < ticket.fence <= self.fence and 0 < ticket.attempt <= self.attempt
         older = (ticket.attempt, ticket.fence) < (self.attempt, self.fence)
         return Verdict.LATE if known and older else Verdict.UNKNOWN

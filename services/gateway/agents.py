@@ -26,6 +26,7 @@ class AgentView:
       journal: trials that its journal knows of, as (trial, attempt, fence).
       sample: the newest of the rollout under way.
       stop: that its robot was sent and has not obeyed yet.
+      held: why it is given no trial, since it was stopped; empty once a study goes on.
     """
 
     name: str
@@ -37,6 +38,7 @@ class AgentView:
     journal: set[tuple[str, int, int]] = field(default_factory=set)
     sample: Sample | None = None
     stop: Stop | None = None
+    held: str = ""
     _shown: tuple[bool, AgentState | None] = (False, None)
 
     @property
@@ -91,6 +93,10 @@ class AgentView:
             return f"is {self.state or 'silent'}"
         if self.trial:
             return f"is at {self.trial}"
+        if self.stop:
+            return "has not said that it is limp since it was stopped"
+        if self.held:
+            return f"was stopped ({self.held}): resume the study to let it walk"
         return None
 
     def document(self) -> dict[str, Any]:
@@ -108,5 +114,6 @@ class AgentView:
             "silent_seconds": round(silent, 3) if silent < float("inf") else None,
             "state": self.state.value if self.state else None,
             "trial": self.trial,
+            "held": self.held,
             "health": self.health,
         }

@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pup.transfer import orders
 from pup.transfer.study import Study, StudySettings
-from services.gateway import job_routes, lab_pages, names, pages, problems
+from services.gateway import job_routes, lab_pages, names, pages, problems, stops
 from services.gateway.access import (
     BODY_LIMIT,
     CHALLENGE,
@@ -261,9 +261,9 @@ async def pause_study(
 async def resume_study(
     request: Request, user: Operator, study: StudyName, key: IdempotencyKey = None
 ) -> Response:
-    """Make trials again."""
+    """Make trials again; robots that were stopped may walk for the study again."""
     conductor = conductor_of(request)
-    told = await conductor.change(study, user.name, orders.resume, "resumed")
+    told = await conductor.go_on(study, user.name, orders.resume, "resumed")
     return as_json(study_document(told))
 
 
@@ -292,7 +292,7 @@ async def retry_trial(
 ) -> Response:
     """Run an aborted or lost trial again; `attempt` is the number of the new attempt."""
     order = partial(orders.retry, number=number, attempt=wanted.attempt)
-    told = await conductor_of(request).change(study, user.name, order, "retried")
+    told = await conductor_of(request).go_on(study, user.name, order, "retried")
     return _trial(told, number)
 
 
@@ -317,7 +317,7 @@ async def void_trial(
     why: Reason,
     key: IdempotencyKey = None,
 ) -> Response:
-    """Let a walk not count after all, before an eta is chosen by it; the study pauses."""
+    """Let a walk not count after all; the study pauses, and chooses anew what it chose by it."""
     reason = f"made void by {user.name}: {why.reason}"
     order = partial(orders.void, number=number, reason=reason)
     told = await conductor_of(request).change(study, user.name, order, "voided")
@@ -349,9 +349,12 @@ async def stream_agents(request: Request, _: Viewer) -> Response:
 async def stop_agent(
     request: Request, user: Operator, agent: AgentName, why: Reason, key: IdempotencyKey = None
 ) -> Response:
-    """Emergency stop by message; the switch at the robot is faster. Each request sends one."""
-    await conductor_of(request).stop(agent, user.name, why.reason)
-    return as_json({"stopped": agent}, 202)
+    """Emergency stop by message; the switch at the robot is faster. Each request sends one.
+
+    The answer's `unwritten` tells what could not be written within 2 s.
+    """
+    unwritten = await stops.stop(conductor_of(request), agent, user.name, why.reason)
+    return as_json({"stopped": agent, "unwritten": unwritten}, 202)
 
 
 def _service() -> APIRouter:

@@ -11,10 +11,13 @@ from services.gateway.agents import AgentView
 def unfit(
     study: Study, studies: Mapping[str, Study], agents: Mapping[str, AgentView]
 ) -> dict[str, str | None]:
-    """Why each agent that may take a study's trial cannot; None where it can."""
+    """Why each agent that may take a study's trial cannot; None where it can.
+
+    Where an agent has begun a trial of the study, or the study names one, it is that one alone.
+    """
     trials = (s.open for s in studies.values())
     busy = {t.agent: t.id for t in trials if t and t.state in HANDED_OUT}
-    settings, wanted = study.settings, study.settings.agent
+    settings, wanted = study.settings, study.agent
     told: dict[str, str | None] = {}
     for name in [wanted] if wanted else sorted(agents):
         view = agents.get(name)
@@ -38,8 +41,9 @@ def waits_for(study: Study, studies: Mapping[str, Study], agents: Mapping[str, A
         return "the study to be resumed"
     reasons = unfit(study, studies, agents)
     fit = [name for name, why in reasons.items() if why is None]
-    told = "; ".join(f"{name} {why}" for name, why in reasons.items())
-    return "" if fit else f"an agent: {told or 'none is known'}"
+    told = "; ".join(f"{name} {why}" for name, why in reasons.items()) or "none is known"
+    began = study.agent is not None and study.settings.agent is None
+    return "" if fit else f"an agent: {told}{', and no other may go on' if began else ''}"
 
 
 def assignment(study: Study, trial: Trial) -> Assign:

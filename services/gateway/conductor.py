@@ -32,7 +32,7 @@ from pup.transfer.trial import (
     TrialState,
     Verdict,
 )
-from pup.wire import Accepted, Armed, Cancel, Finished, Running, Stop
+from pup.wire import Accepted, Armed, Cancel, Finished, Running
 from services.gateway import fits
 from services.gateway.agents import AgentView
 from services.gateway.assignment import place_of, unfit, waits_for
@@ -46,8 +46,6 @@ log = logging.getLogger(__name__)
 
 PERIOD = 0.5
 """Between two looks at leases, idle agents and unanswered assignments, s."""
-CONFIRMED = 2.0
-"""In which a robot must say that it has stopped, s."""
 
 REPORTED = {
     Accepted: TrialState.ASSIGNED,
@@ -106,7 +104,7 @@ class Conductor:
             if view.changed():
                 self.notify("")
                 for study in self.studies.values():
-                    if view.name in (study.settings.agent, study.open and study.open.agent):
+                    if view.name in (study.agent, study.open and study.open.agent):
                         self.notify(study.name)
         for name in list(self.studies):
             if self.studies[name].state is not StudyState.DONE:
@@ -159,6 +157,15 @@ class Conductor:
         self._go_on(name)
         return study
 
+    async def go_on(self, name: str, who: str, act: Callable[[Study], Study], kind: str) -> Study:
+        """Do what lets a study go on; robots that were stopped may walk for it again."""
+        study = await self.change(name, who, act, kind)
+        if study.state is StudyState.ACTIVE:  # not where an order that was given before comes again
+            for view in self.agents.values():
+                if study.agent in (None, view.name):
+                    view.held = ""
+        return study
+
     async def cancel(self, name: str, number: int, who: str, reason: str = "") -> Study:
         """Take a trial back, or ask its agent to stop it; the study pauses."""
         reason = reason or f"cancelled by {who}"
@@ -166,35 +173,6 @@ class Conductor:
         study = await self.change(name, who, order, "cancelled")
         self.courier.recall(study.trial(number))
         return study
-
-    async def stop(self, agent: str, who: str, reason: str) -> None:
-        """Stop a robot, now; then pause what it was at, or would be next.
-
-        It is told again until it says that it is limp.
-
-        Raises:
-          TrialError: it has not said so.
-        """
-        if agent not in self.agents:
-            raise UnknownError(f"there is no agent {agent}")
-        view = self.agents[agent]
-        view.stop = Stop(f"{who}: {reason}")
-        self.courier.send(agent, view.stop)
-        told = f"{agent} was stopped by {who}: {reason}"
-        for name in list(self.studies):
-            order = partial(orders.halt, agent=agent, reason=told)
-            study = await self.change(name, who, order, "stopped")
-            if study.open:
-                self.courier.recall(study.open)
-        await self.store.log([Event("stopped", who, detail={"agent": agent, "reason": reason})])
-        end = time.monotonic() + CONFIRMED
-        while view.stop and view.present and time.monotonic() < end:
-            await asyncio.sleep(0.05)
-        if view.stop:
-            raise TrialError(
-                f"{agent} has not said that it is limp: use the switch at the robot; it is told "
-                "again, and its studies are paused"
-            )
 
     def heard(self, agent: str, trial: str | None) -> None:
         """A sign of life: it renews the lease of the trial that it names."""
@@ -236,6 +214,7 @@ class Conductor:
             body.recording,
             body.digest,
         )
+        self.heard(agent, body.trial)  # the walk is over, not the telling of it
         async with self._locks[name]:
             study = self.studies[name]
             before = study.trial(number)
@@ -244,7 +223,9 @@ class Conductor:
             )
             if verdict is Verdict.COUNTED:
                 event = Event(trial.state.value, agent, number, asdict(body))
-                study = orders.after_end(study.with_trial(trial), trial)
+                study = study.with_trial(trial)
+                if before.state is not TrialState.LOST:  # else that was told when it was lost
+                    study = orders.after_end(study, trial)
                 await self._write(Change(study, [trial], [event]))
                 self.metrics.trials.labels(trial.state.value).inc()
             elif verdict is not Verdict.REPEATED:

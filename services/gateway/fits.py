@@ -83,7 +83,7 @@ def _imported() -> None:
 
 
 def search_of(study: Study, simulated: Row | None) -> Any:
-    """What the optimiser gets to know of a study: all its walks, in the order of their numbers."""
+    """What the optimiser gets to know of a study: all its trials, in the order of their numbers."""
     from pup.transfer.optimizer import Search
     from pup.transfer.surrogate import Simulated
 
@@ -105,6 +105,8 @@ def search_of(study: Study, simulated: Row | None) -> Any:
         used and Simulated(np.array(used["eta"], float), np.array(used["distance"], float)),
         feasible,
         settings.trials,
+        tuple(t.eta for t in study.fruitless),
+        tuple(t.eta for t in study.fruitless_since),
     )
 
 

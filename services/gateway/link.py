@@ -110,13 +110,18 @@ class Link:
         return known
 
     def refresh_keys(self) -> None:
-        """Read the agents' keys where a file changed; who is gone is let in no more."""
+        """Read the agents' keys where a file changed; whose key is gone is let in no more.
+
+        A new key in a file of the same name is another robot, or one that was set up anew: nothing
+        goes to the connection of the old one.
+        """
         files = self.ring.stamp()
         if files == self._files:
             return
+        before = self.names
         self.names, self._files = self.ring.agents(), files
-        for name in self.routes.keys() - set(self.names.values()):
-            del self.routes[name]
+        for name in {n for key, n in before.items() if self.names.get(key) != n}:
+            self.routes.pop(name, None)
             self.conductor.agents[name].hello = None  # it can be given no trial
         for name in self.names.values():
             self.conductor.agents.setdefault(name, AgentView(name))
