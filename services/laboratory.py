@@ -6,6 +6,7 @@ can. Everything ends with the laboratory, and with its owner where that is kille
 """
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -29,9 +30,6 @@ from services.gateway.keys import KeyRing, Role, Tokens
 from workers import reaper
 
 AGENT, OPERATOR = "virtual", "run"
-RATE = 1 / 0.031
-"""Of the control loop, Hz: within the paper's 25 to 33, and of whole milliseconds, in which
-the virtual robot's time passes."""
 PATIENCE = 120.0
 """For a process to be ready, s; the machine may be busy."""
 GRACE = 15.0
@@ -81,6 +79,14 @@ gateway_key = {gateway_key}
 upload = false
 """
 """Of the agent: patient, since nothing can fall while it waits and time stands still."""
+
+
+def period_of(robot: RobotDescription) -> float:
+    """Of the control loop, s: the shortest that the robot's rates allow, in whole milliseconds.
+
+    The virtual robot's time passes in these.
+    """
+    return math.ceil(1000 / robot.walk.control_rate[1]) / 1000
 
 
 class Laboratory(AbstractContextManager["Laboratory"]):
@@ -189,12 +195,13 @@ class Laboratory(AbstractContextManager["Laboratory"]):
         told = {"agent": AGENT, "robot": self.robot.folder.absolute(), "state": state}
         told |= {"policies": self.policy, "link": gateway, "key": keys[0], "gateway_key": keys[1]}
         quoted = {name: json.dumps(str(value), ensure_ascii=False) for name, value in told.items()}
-        return CONFIG.format(**quoted, passing=f'"{self._passing}', rate=RATE)
+        return CONFIG.format(**quoted, passing=f'"{self._passing}', rate=1 / period_of(self.robot))
 
     def _robot(self, doors: Mapping[str, Path]) -> list[str]:
         told = ["--robot", str(self.robot.folder.absolute()), "--seed", str(self.seed)]
         told += ["--link", str(doors["bus"]), "--imu", str(doors["imu"])]
-        return [*told, "--side", str(doors["side"]), "--speed", "0", "--period", str(1 / RATE)]
+        told += ["--side", str(doors["side"]), "--period", str(period_of(self.robot))]
+        return [*told, "--speed", "0"]
 
     def _start(self, name: str) -> None:
         self._starts[name] = self._starts.get(name, 0) + 1

@@ -12,7 +12,7 @@ from hardware_agent.virtual.fleet import Fleet
 from hardware_agent.virtual.walks import walk
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
-from services.laboratory import RATE, Laboratory
+from services.laboratory import Laboratory, period_of
 from services.trials import Budget, follow
 
 DARWIN = RobotDescription.load("darwin_op2")
@@ -28,7 +28,7 @@ def test_a_walk_without_packets_is_as_long_as_one_through_the_bus(tmp_path: Path
     trials = study["trials"]
     assert [trial["state"] for trial in trials] == ["succeeded"] * 3
     eta = np.array([trial["eta"] for trial in trials])
-    told = walk(Fleet(DARWIN, [SEED] * 3), policy, eta, 6.0, 1 / RATE)
+    told = walk(Fleet(DARWIN, [SEED] * 3), policy, eta, 6.0, period_of(DARWIN))
     assert told.distance == pytest.approx([trial["distance"] for trial in trials], abs=0.05)
     assert (told.time == 6.0).all()
     assert told.distance.min() > 0.3
@@ -39,9 +39,9 @@ def test_who_falls_has_come_as_far_as_until_then() -> None:
     fleet = Fleet(DARWIN, [SEED, SEED])
     middle = np.add(policy.card.eta_lower, policy.card.eta_upper) / 2
     same = np.stack([middle, middle])
-    told = walk(fleet, policy, same, 2.0, 1 / RATE)
+    told = walk(fleet, policy, same, 2.0, period_of(DARWIN))
     assert told.distance[0] == told.distance[1]  # the same robot, the same noise
-    lame = walk(Fleet(DARWIN, [SEED]), _lame(policy), same[:1], 6.0, 1 / RATE)
+    lame = walk(Fleet(DARWIN, [SEED]), _lame(policy), same[:1], 6.0, period_of(DARWIN))
     assert 0.0 < lame.time[0] < 6.0
     assert lame.distance[0] < told.distance[0]
 
