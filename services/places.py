@@ -72,7 +72,6 @@ def _shared_out(options: argparse.Namespace) -> int:
       FailedError: others have the cores, or nodes are away; there may be room another time.
     """
     from workers import nodes
-    from workers.cluster import cores_free, cores_in_all
 
     runners = options.runners
     if not runners:
@@ -80,13 +79,13 @@ def _shared_out(options: argparse.Namespace) -> int:
     if options.cores:
         _tell_who_waits(runners, options.cores)
         return cores(options)
-    if share := nodes.largest_share(nodes.cores_free(), runners):
+    free = nodes.cores_free()
+    if share := nodes.largest_share(free, runners):
         return share * runners
-    free = cores_free()
-    if runners < cores_in_all():
-        raise FailedError(f"{free} cores of the cluster are free for {runners} runners")
+    if runners < sum(nodes.cores_whole()):
+        raise FailedError(f"{sum(free)} cores of the cluster are free for {runners} runners")
     raise InputError(
-        f"--runners {runners}, where {free} cores of the cluster are free beside this "
+        f"--runners {runners}, where {sum(free)} cores of the cluster are free beside this "
         "process; use fewer, or say by --cores how many there will be on one that grows"
     )
 

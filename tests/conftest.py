@@ -45,6 +45,17 @@ def shared() -> Path:
     return SHARED
 
 
+@pytest.fixture(scope="module")
+def ray_here() -> Iterator[None]:
+    """A Ray of two cores, whose runners can import the tests' own tasks."""
+    from workers.cluster import connected  # Ray is for those who ask for it
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        with connected(cores=2):
+            yield
+
+
 @pytest.fixture(scope="session")
 def check_contract(shared: Path) -> Callable[[Path], None]:
     """Runs the contract checker on a file or folder and fails with what it prints."""

@@ -6,6 +6,8 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -136,3 +138,16 @@ class RayCluster:
 
     def _log(self, node: str) -> Path:
         return self.folder / f"{node}.log"
+
+
+@contextmanager
+def two_workers(folder: Path) -> Iterator[RayCluster]:
+    """A head and two workers of two cores each."""
+    made = RayCluster(folder)
+    try:
+        made.start_head()
+        for number in (1, 2):
+            made.start_worker(number, cpus=2)
+        yield made
+    finally:
+        made.close()

@@ -1,7 +1,10 @@
 """Distances that somebody types: in metres, of a walk that may have been over for a day."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from agents import bundle, standing, wait
@@ -60,15 +63,22 @@ def test_who_was_asked_again_may_tell_another(measuring: tuple[Conductor, list[B
     assert ended.distance == 0.3
 
 
-def test_a_distance_is_asked_for_again_after_the_agent_was_killed(tmp_path: Path) -> None:
-    """Twice; what comes of it is the walk as it was, with its recording, walked once."""
+@contextmanager
+def killed_before_its_distance(folder: Path) -> Iterator[tuple[Any, Any, str]]:
+    """An agent that was killed as it waited for the distance of `a`, its gateway and the policy."""
     pytest.importorskip("mujoco")
-    policy = bundle(tmp_path / "policies" / "still", standing())
+    policy = bundle(folder / "policies" / "still", standing())
     more = BY_HAND.replace('gate = "operator"', 'gate = "auto"')
-    with at_work(tmp_path, more=more) as (made, gateway):
+    with at_work(folder, more=more) as (made, gateway):
         gateway.send(assign(policy, "a"))
         wait(lambda: made.health()["waiting"] == "distance", 30, made.log)
         made.kill()
+        yield made, gateway, policy
+
+
+def test_a_distance_is_asked_for_again_after_the_agent_was_killed(tmp_path: Path) -> None:
+    """Twice; what comes of it is the walk as it was, with its recording, walked once."""
+    with killed_before_its_distance(tmp_path) as (made, gateway, policy):
         made.start()
         told = made.health()
         assert (told["trial"], told["stage"], told["waiting"]) == ("a", "measuring", "distance")
@@ -97,13 +107,7 @@ def test_a_distance_is_asked_for_again_after_the_agent_was_killed(tmp_path: Path
 def test_a_walk_that_waits_for_its_distance_can_be_taken_back_after_a_restart(
     tmp_path: Path,
 ) -> None:
-    pytest.importorskip("mujoco")
-    policy = bundle(tmp_path / "policies" / "still", standing())
-    more = BY_HAND.replace('gate = "operator"', 'gate = "auto"')
-    with at_work(tmp_path, more=more) as (made, gateway):
-        gateway.send(assign(policy, "a"))
-        wait(lambda: made.health()["waiting"] == "distance", 30, made.log)
-        made.kill()
+    with killed_before_its_distance(tmp_path) as (made, gateway, _):
         known = len(gateway.of(Hello))
         made.start()
         wait(lambda: len(gateway.of(Hello)) > known, 20, made.log)

@@ -30,14 +30,8 @@ def shared(tmp_path_factory, bench_recordings):
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    made = ray_clusters.RayCluster(tmp_path_factory.mktemp("ray"))
-    try:
-        made.start_head()
-        for number in (1, 2):
-            made.start_worker(number, cpus=2)
+    with ray_clusters.two_workers(tmp_path_factory.mktemp("ray")) as made:
         yield made
-    finally:
-        made.close()
 
 
 @pytest.fixture(scope="module")

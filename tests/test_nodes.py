@@ -8,7 +8,7 @@ import pytest
 from commandline import pup_process
 from hypothesis import given
 from hypothesis import strategies as st
-from ray_clusters import RayCluster
+from ray_clusters import RayCluster, two_workers
 
 from pup.errors import InputError
 from services.places import training
@@ -57,14 +57,8 @@ def test_runners_that_wait_for_a_cluster_to_grow_say_so(
 
 @pytest.fixture
 def two_nodes(tmp_path: Path) -> Iterator[RayCluster]:
-    cluster = RayCluster(tmp_path)
-    try:
-        cluster.start_head()
-        for number in (1, 2):
-            cluster.start_worker(number, cpus=2)
+    with two_workers(tmp_path) as cluster:
         yield cluster
-    finally:
-        cluster.close()
 
 
 @pytest.mark.ray

@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -33,7 +32,6 @@ from pup.robot_writer import write_corrected
 from services import training
 from services.arguments import parser
 from services.training_options import Options, training_options
-from workers.cluster import connected
 from workers.learner import FragmentsToBatch, Learning, merged, prepared, shuffled
 from workers.module import PolicyModule, load
 from workers.ppo import Iteration, Setup, Trainer, learner_place
@@ -44,14 +42,6 @@ SAMPLING = Sampling(ToyTask, simulations=32, steps=32, seed=0, threads=1)
 LEARNING = Learning(epochs=4, minibatch=256, rate=1e-3, iterations=30)
 TOY = Setup(SHAPE, SAMPLING, LEARNING)
 ROBOT = RobotDescription.load("darwin_op2")
-
-
-@pytest.fixture(scope="module")
-def ray_here() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # runners import the toy
-        with connected(cores=2):
-            yield
 
 
 def policy() -> ProjectedPolicy:

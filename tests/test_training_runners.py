@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from pup.robot import RobotDescription
 from services import training
 from services.training_options import Options
 from workers import runners
-from workers.cluster import connected
 from workers.learner import Learning
 from workers.ppo import Setup, Trainer
 from workers.rollouts import Sampling
@@ -39,14 +37,6 @@ SMALL = Options(
     learning=Learning(epochs=1, minibatch=16, weights=LossWeights()),
     runners=2,
 )
-
-
-@pytest.fixture(scope="module")
-def ray_here() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # runners import the toy
-        with connected(cores=2):
-            yield
 
 
 class Elsewhere(ToyTask):

@@ -95,16 +95,6 @@ def cores_there() -> int:
     return int(ray.cluster_resources().get("CPU", 1))
 
 
-def cores_in_all() -> int:
-    """Cores of that Ray, whoever has them."""
-    return int(ray.cluster_resources().get("CPU", 0))
-
-
-def cores_free() -> int:
-    """Cores of that Ray which nobody has; a job's process has some itself."""
-    return int(ray.available_resources().get("CPU", 0))
-
-
 @contextmanager
 def _joined(address: str) -> Iterator[None]:
     _probe(address)

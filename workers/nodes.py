@@ -7,7 +7,7 @@ from ray._private.state import available_resources_per_node
 
 
 def cores_free() -> list[int]:
-    """Cores of each node that nobody has."""
+    """Cores of each node that nobody has; a job's process has some itself."""
     return [int(node.get("CPU", 0)) for node in available_resources_per_node().values()]
 
 
