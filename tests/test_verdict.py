@@ -11,14 +11,17 @@ from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.verdict import (
+    OTHER_FORM,
     Finding,
+    Parameter,
     doubt,
     in_order,
     left_over,
+    of_other_form,
     probabilities,
     twins_of,
 )
-from pup.physics.terms import Place
+from pup.physics.terms import TERMS, Place
 from tests.diagnosis_cases import BENCH, recordings
 
 MEASURED = Measured.of(BENCH, recordings({}))
@@ -121,3 +124,16 @@ def test_findings_stand_by_what_they_explain_where_none_is_of_a_usual_size_for_s
     clock, ripple = found("clock_skew", 8000.0, 0.2), found("cogging", 400.0, 0.4, 0.3)
     nameless = found("unknown", 100.0, np.inf)
     assert in_order([nameless, ripple, clock]) == (clock, ripple, nameless)
+
+
+def test_an_interval_is_as_wide_as_a_law_of_another_form_asks() -> None:
+    torque = next(q for q in TERMS["coulomb_friction"].quantities if not q.shape)
+    sharp = of_other_form(Parameter(0.1, "N m", 0.0999, 0.1001), torque)
+    assert sharp.upper - 0.1 == pytest.approx(0.1 * OTHER_FORM, rel=1e-4)
+    blunt = of_other_form(Parameter(0.1, "N m", 0.05, 0.2), torque)  # noise tells the most of it
+    assert (blunt.lower, blunt.upper) == pytest.approx((0.0483, 0.2008), abs=1e-4)
+    most = Parameter(torque.limit, "N m", 0.9 * torque.limit, torque.limit)
+    assert of_other_form(most, torque).upper == torque.limit
+    shape = next(q for q in TERMS["stribeck_friction"].quantities if q.shape)
+    speed = Parameter(0.1, "rad/s", 0.09, 0.11)
+    assert of_other_form(speed, shape) == speed

@@ -181,6 +181,8 @@ class Term:
       source: where the typical sizes come from.
       layout: what the columns of the values are: the joints, the joints that carry a body, the
         model's bodies, the feet and the floor, or one for all.
+      constant: whether it is a number that the robot has, as a mass or a delay, and not a law whose
+        real form may be another.
       needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
@@ -195,6 +197,7 @@ class Term:
     quantities: ClassVar[tuple[Quantity, ...]]
     source: ClassVar[str]
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
+    constant: ClassVar[bool] = False
     needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 

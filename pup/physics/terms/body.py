@@ -14,6 +14,7 @@ class Payload(Term):
     """A mass at a body's centre of mass; negative where the model is too heavy."""
 
     effect = "payload"
+    constant = True
     kinds = ("body",)
     layout = "bodies"
     quantities = (Quantity("mass", "kg", 0.05, 1.0, signed=True),)
@@ -29,6 +30,7 @@ class Armature(Term):
     """Inertia of a joint's rotor and gear beyond the nominal."""
 
     effect = "armature"
+    constant = True
     kinds = ("joint",)
     quantities = (Quantity("inertia", "kg m2", 0.003, 0.05),)
     source = "MX-28: 193:1 gear on a coreless rotor, 0.001 to 0.01"
@@ -44,6 +46,7 @@ class ComOffset(Term):
     """A body's centre of mass is elsewhere, in the body's own axes."""
 
     effect = "com_offset"
+    constant = True
     kinds = ("body",)
     layout = "bodies"
     quantities = tuple(Quantity(axis, "m", 0.01, 0.1, signed=True) for axis in "xyz")
@@ -78,6 +81,7 @@ class ExternalForce(Term):
     """A constant force on a body, in the world's axes: a tether, wind."""
 
     effect = "external_force"
+    constant = True
     kinds = ("body",)
     layout = "bodies"
     quantities = tuple(Quantity(axis, "N", 1.0, 30.0, signed=True) for axis in "xyz")

@@ -83,6 +83,7 @@ class GroundSlope(Term):
     """The floor leans: gravity is turned against it, and with it what the IMU tells."""
 
     effect = "ground_slope"
+    constant = True
     kinds = ("ground",)
     layout = "one"
     quantities = (

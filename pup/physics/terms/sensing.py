@@ -13,6 +13,7 @@ class EncoderBias(Term):
     """The encoder's zero is off: what it tells is the position plus this."""
 
     effect = "encoder_bias"
+    constant = True
     kinds = ("joint",)
     quantities = (Quantity("offset", "rad", 0.02, 0.3, signed=True),)
     source = "estimate: 5 to 50 mrad after reassembly"
@@ -56,6 +57,7 @@ class MeasurementDelay(Term):
     """Positions are read earlier than their rows say; the servo's own loop is not late."""
 
     effect = "measurement_delay"
+    constant = True
     kinds = ("joint", "group", "bus")
     quantities = (Quantity("time", "s", 0.01, 0.06),)
     source = "reading 20 servos one after the other takes 10 ms (paper, section III)"
@@ -73,6 +75,7 @@ class ScanDelay(Term):
     """
 
     effect = "scan_delay"
+    constant = True
     kinds = ("bus",)
     quantities = (Quantity("time", "s", 0.01, 0.06, signed=True),)
     source = "reading 20 servos one after the other takes 10 ms (paper, section III)"
@@ -88,6 +91,7 @@ class ImuMisalignment(Term):
     """The IMU is mounted with a turn against its site."""
 
     effect = "imu_misalignment"
+    constant = True
     kinds = ("sensor",)
     layout = "one"
     quantities = (
@@ -114,6 +118,7 @@ class ImuDelay(Term):
     """The IMU's angles are older than their rows say."""
 
     effect = "imu_delay"
+    constant = True
     kinds = ("sensor",)
     layout = "one"
     quantities = (Quantity("time", "s", 0.02, 0.1),)

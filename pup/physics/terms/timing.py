@@ -12,6 +12,7 @@ class CommandDelay(Term):
     """Commands reach the servo later than their rows say."""
 
     effect = "command_delay"
+    constant = True
     kinds = ("joint", "group", "bus")
     quantities = (Quantity("time", "s", 0.012, 0.08),)
     source = "9.5 ms (PACE, issue 19), 5 to 20 ms (unitree_sim_isaaclab, issue 108)"
@@ -25,6 +26,7 @@ class ClockSkew(Term):
     """Positions are stamped by another clock than commands; it goes slow by this share."""
 
     effect = "clock_skew"
+    constant = True
     kinds = ("robot",)
     layout = "one"
     quantities = (Quantity("share", "1", 0.002, 0.02, signed=True),)
