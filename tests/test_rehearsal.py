@@ -60,6 +60,10 @@ def test_a_simulator_foretells_its_own_walks(tmp_path: Path) -> None:
     assert first["rank_correlation"] is None  # the robot walks all etas alike
     assert "trust no policy" in rehearsal_words(first)
     assert (tmp_path / "out" / "rehearsal.png").read_bytes().startswith(b"\x89PNG")
+    falls = study(tmp_path / "falls.json", *(trial(eta, 0.0, 0.5) for eta in ETAS))
+    bold = again(falls, tmp_path / "bold")
+    assert not bold["walks_alike"]  # what is simulated stays up for longer
+    assert "walks where the robot falls" in rehearsal_words(bold)
     told = [trial(e["eta"], e["simulated_distance"], e["simulated_time"]) for e in first["etas"]]
     own = again(study(tmp_path / "own.json", *told), tmp_path / "own")
     assert own["apart"] == pytest.approx(0.0, abs=1e-12)
