@@ -27,6 +27,12 @@ MAX_TICK = 0.5  # s; no servo is driven as slowly, but a clock in ms looks so
 BEYOND, MARGIN = 4.0, 2.0
 """Play, a fall or a turn of its servo may bring a joint beyond its limits, but not beyond so many
 times the larger one, and so much more, rad; degrees and encoder ticks are."""
+TILTS = {"imu/roll": 2 * math.pi, "imu/pitch": math.pi / 2 + 0.1}
+"""Largest angles of the torso, rad: the pitch of Z-Y-X Euler angles ends at a quarter of a turn;
+the roll ends at a half, and may be unwrapped."""
+MOVING, FASTER = 0.1, 6.0
+"""A joint that moves by more, rad/s rms, tells the unit of its velocity: deg/s are 57 times what
+its positions change by, rpm 9.5 times. One that rattles between readings may be far above 1."""
 
 
 def check_metadata(metadata: object) -> dict[str, Any]:
@@ -142,6 +148,36 @@ def check_units(joints: Sequence[Joint], columns: Mapping[str, Array]) -> None:
                     f"to [{joint.lower:g}, {joint.upper:g}]; are these degrees, encoder ticks or "
                     "mm?"
                 )
+    _check_velocities([joint.name for joint in joints], columns)
+    for name, largest in TILTS.items():
+        values = columns.get(name, np.zeros(0))
+        for row in np.flatnonzero(np.abs(values) > largest):
+            raise InputError(
+                f"column {name!r}, row {row}: {values[row]:g}, beyond {largest:.3g} rad; are these "
+                "degrees?"
+            )
+
+
+def _check_velocities(joints: Sequence[str], columns: Mapping[str, Array]) -> None:
+    """Refuse velocities that are, at most joints, many times what the positions change by."""
+    factors: dict[str, float] = {}
+    for joint in joints:
+        position, told = columns[f"position/{joint}"], columns.get(f"velocity/{joint}")
+        both = np.zeros(0, bool) if told is None else ~np.isnan(position) & ~np.isnan(told)
+        if told is not None and both.sum() > 2:
+            changes = np.diff(position[both]) / np.diff(columns["time"][both])
+            if (moved := _rms(changes)) > MOVING:
+                factors[joint] = _rms(told[both]) / moved
+    if factors and float(np.median(list(factors.values()))) > FASTER:
+        joint, factor = max(factors.items(), key=lambda item: item[1])
+        raise InputError(
+            f"column 'velocity/{joint}': {factor:.2g} times what its positions change by; is it in "
+            "deg/s, rpm or ticks?"
+        )
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _check_setup(setup: object) -> None:

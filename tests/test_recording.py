@@ -199,3 +199,23 @@ def test_validate_refuses_other_units_and_lets_a_robot_fall() -> None:
             far.validate(robot)
     with pytest.raises(InputError, match=r"'r1': column 'time': rows are 30 s apart; .* in ms"):
         dataclasses.replace(SERVO, time=[0.0, 30.0, 60.0]).validate(robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("imu/pitch", [0.0, 12.5, 3.0], r"'imu/pitch', row 1: 12\.5, beyond 1\.67 rad; .* degrees"),
+        ("imu/roll", [0.0, np.nan, -30.0], r"'imu/roll', row 2: -30, beyond 6\.28 rad; .* degrees"),
+        ("velocity/servo", np.degrees([1.0, 1.0, 1.0]), "57 times what its positions .* deg/s"),
+    ],
+)
+def test_validate_refuses_degrees_in_what_is_recorded_besides(
+    name: str, values: list[float], said: str
+) -> None:
+    robot = RobotDescription.load("servo_bench")
+    moving = dataclasses.replace(
+        SERVO, position=np.array([[0.0], [0.1], [0.2]]), time=[0, 0.1, 0.2]
+    )
+    dataclasses.replace(moving, extras={name: np.radians(values)}).validate(robot)
+    with pytest.raises(InputError, match=said):
+        dataclasses.replace(moving, extras={name: values}).validate(robot)
