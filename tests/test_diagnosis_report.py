@@ -208,6 +208,12 @@ def test_report_of_a_mismatch(backlash: Diagnosis, tmp_path: Path) -> None:
     assert len(shown.table("Recording")) == 4
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_what_no_recording_tells_apart_is_admitted(backlash: Diagnosis, tmp_path: Path) -> None:
+    shown = page(backlash, tmp_path)
+    assert "tells gear backlash at the left knee from commands that arrive late" in shown.text
+
+
 def test_figures_are_self_contained_and_told(backlash: Diagnosis, tmp_path: Path) -> None:
     shown = page(backlash, tmp_path)
     images = shown.all("img")

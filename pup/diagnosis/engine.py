@@ -274,13 +274,15 @@ def _next(
     selector: Selector,
     factory: Callable[[Measured], Replays],
 ) -> NextRecording | None:
-    """What to record next: what would settle the most important finding that is not settled."""
+    """What to record next: what would settle the most important finding that can be settled."""
+    robot = selector.replays.measured.robot
     for finding in found:
         if finding.equivalents:
-            key = finding.effect, finding.place
-            chosen = chosen_in(rounds, key)
+            chosen = chosen_in(rounds, (finding.effect, finding.place))
             rivals = rivals_of(finding, chosen, selector)
-            return next_recording(selector.replays.measured.robot, rivals, selector.noise, factory)
+            ask = next_recording(robot, rivals, selector.noise, factory)
+            if ask is not None:
+                return ask
     return None
 
 

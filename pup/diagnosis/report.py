@@ -307,8 +307,9 @@ class _Report:
         )
 
     def record_next(self) -> Iterator[Html]:
-        """The recording that would tell more."""
+        """The recording that would tell more; where none would, that it is so."""
         if not self.next:
+            yield from self.record_none()
             return
         yield tag("p", tag("strong", "Motion: "), str(self.next.get("motion", "")))
         reason = str(self.next.get("reason", "")).removesuffix(".")
@@ -326,6 +327,21 @@ class _Report:
             if finding.equivalents:
                 named = self.speech.words(finding.effect, finding.place)
                 yield tag("p", f"{capital(named)}: {otherwise(finding, self.speech)}")
+
+    def record_none(self) -> Iterator[Html]:
+        """Why nothing is asked for though findings have rivals."""
+        for finding in self.diagnosis.findings:
+            if not finding.equivalents:
+                continue
+            one, *others = (
+                self.speech.words(claim.effect, claim.place)
+                for claim in (finding, *finding.equivalents)
+            )
+            yield tag(
+                "p",
+                f"No motion and no change of the setup that could be asked for tells {one} from "
+                f"{listed(others)}: whichever it is, the corrected simulator moves alike.",
+            )
 
     def came_about(self) -> Iterator[Html]:
         """How the result came about."""
