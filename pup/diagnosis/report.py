@@ -333,10 +333,8 @@ class _Report:
         for finding in self.diagnosis.findings:
             if not finding.equivalents:
                 continue
-            one, *others = (
-                self.speech.words(claim.effect, claim.place)
-                for claim in (finding, *finding.equivalents)
-            )
+            one = self.speech.words(finding.effect, finding.place)
+            others = [self.speech.words(a.effect, a.place) for a in finding.equivalents]
             yield tag(
                 "p",
                 f"No motion and no change of the setup that could be asked for tells {one} from "
