@@ -48,11 +48,19 @@ def experiment(verb: argparse.ArgumentParser) -> None:
         help="recordings of a real robot, to be identified and diagnosed beside",
     )
     out(verb, "cells/, experiment.json and report.html")
-    verb.add_argument(
+    done = verb.add_mutually_exclusive_group()
+    done.add_argument(
         "--cell",
         type=_name,
         metavar="NAME",
-        help="only do this one again, and compare with what it found before",
+        help="only do this one again, and compare with what it found before; all other options as "
+        "it was done with",
+    )
+    done.add_argument(
+        "--redo",
+        action="store_true",
+        help="delete what cells found that were done with another plan or other options, and do "
+        "them anew; else they are refused",
     )
     place(verb)
 

@@ -113,6 +113,11 @@ class Journal:
         left = self._entry(stage).get("files", {})
         return {name: digest for name, digest in left.items() if name in names}
 
+    def inputs(self, name: str) -> dict[str, str]:
+        """What a step was done from; nothing where it is not done."""
+        entry = self._told["stages"].get(name)
+        return dict(entry.get("inputs", {})) if isinstance(entry, dict) else {}
+
     def done(self, name: str) -> Done:
         """What is told of a step that is done."""
         return Done(**self._told["stages"][name])

@@ -22,7 +22,9 @@ def bounds_table(document: dict[str, Any], unit: str) -> None:
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
     for p in document["parameters"]:
         numbers = [f"{p[k]:.4g}" for k in ("nominal", "lower", "upper")]
-        table.add_row(p["name"], *numbers, p["unit"], "yes" if p["identified"] else "no")
+        known = "yes" if p["identified"] else "no"
+        at_end = ", at an end of its range" if p["at_end"] else ""
+        table.add_row(p["name"], *numbers, p["unit"], known + at_end)
     console.print(table)
     train, held = document["loss"]["train"], document["loss"]["held_out"]
     if document["provenance"]["options"].get("as_described"):
@@ -159,7 +161,7 @@ def experiment_table(shown: dict[str, Any]) -> None:
     for column in ("found", "robots", "bar", ""):
         table.add_column(column, justify="right")
     for line in shown["experiment"]["acceptance"]:
-        holds = "holds" if line["holds"] else "does not hold"
-        table.add_row(line["line"], estimated(line), str(line["robots"]), f"{line['bar']:g}", holds)
+        robots = f"{line['robots']} of {line['planned']}"
+        table.add_row(line["line"], estimated(line), robots, f"{line['bar']:g}", line["answer"])
     console.print(table)
     print(f"report: {shown['report']}")

@@ -14,7 +14,8 @@ from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
 from services.arguments import parser
 from services.experiment.cells import chosen, graph
-from services.experiment.plan import STAGES, Plan, Walk, meant, read_plan, small, training
+from services.experiment.plan import MOST, STAGES, Plan, Walk, meant, read_plan, small, training
+from services.gateway.limits import SEEDS
 
 DOCUMENTED = Path(__file__).parents[1] / "docs" / "experiment.md"
 
@@ -54,6 +55,18 @@ REFUSED = {
     "schema = 1\n[fleet]\nsubsets = 0": "fleet: subsets must be 1 or more",
     "schema = 1\n[fleet]\nfraction = 1.5": "fleet: fraction must be above 0, and 1 at most",
     "schema = 1\n[fleet]\nfraction = 0": "fleet: fraction must be above 0, and 1 at most",
+    "schema = 1\n[presysid]\nseed = 3": "presysid.seed: is that of the plan",
+    "schema = 1\n[fleet]\nseed = 0": "fleet.seed: is that of the plan",
+    "schema = 1\n[presysid]\nactuator = 'foo'": "presysid: actuator 'foo' is none of nn_pd, pd",
+    "schema = 1\n[fleet]\nas_described = true": "fleet: values that are kept as described",
+    "schema = 1\n[presysid]\nfolds = 1": "presysid: 1 in folds would leave nothing to fit",
+    "schema = 1\nseed = 3000000000": "seed 3000000000 is too large; seeds must be below 2147",
+    "schema = 1\nseeds = [3000000000]": "seed 3000000000 is too large; seeds must be below 2147",
+    "schema = 1\n[trials]\nhorizon = 900": "trials: horizon is 900; it must be 600 at most",
+    "schema = 1\n[trials]\ntrials = 2000": "trials: trials is 2000; it must be 1000 at most",
+    "schema = 1\n[trials]\nprior = 2000": "trials: prior is 2000; it must be 1000 at most",
+    "schema = 1\n[trials]\nrepeats = 500": "trials: repeats is 500; it must be 100 at most",
+    "schema = 1\n[trials]\nlandscape = 5000": "trials: landscape is 5000; it must be 4096 at most",
     "schema = 1\n[trials]\nhorizon = -1": "trials: horizon, and seconds of diagnosis",
     "schema = 1\n[train]\nfleet = '--see 3'": "unrecognized arguments: --see 3",
     "schema = 1\n[record]\nmotions = []": "a motion and a repeat at least",
@@ -230,6 +243,41 @@ def test_what_is_diagnosed_tells_of_what_is_fitted_where_robots_are_corrected() 
         graph(of("walk"))
     recorded = replace(of().record, motions=("hold",))
     assert graph(replace(of(), record=recorded, stages=("diagnosis",)))
+
+
+def test_more_folds_than_recordings_are_refused() -> None:
+    plan = replace(small(), fleet=replace(small().fleet, folds=2))
+    assert graph(plan)  # a script of each of two robots
+    with pytest.raises(InputError, match="presysid: 2 folds for 1 recordings"):
+        graph(replace(small(), presysid=replace(small().presysid, folds=2)))
+
+
+def test_a_plan_may_ask_for_as_much_as_a_study_of_the_gateway_takes() -> None:
+    pytest.importorskip("fastapi")
+    from services.gateway.shapes import NewStudy
+
+    named = ("trials", "repeats", "horizon")
+    most = replace(small().trials, landscape=MOST["landscape"], **{n: MOST[n] for n in named})
+    plan = replace(small(), trials=most, seed=SEEDS - 1)
+    told = {name: getattr(most, name) for name in named} | {"seed": plan.seed}
+    simulated = {"eta": [[0.0]] * most.landscape, "distance": [[0.0] * most.landscape] * 16}
+    study = NewStudy(name="a", robot="b", policy="0" * 64, simulated=simulated, **told)
+    assert study.simulated is not None and study.simulated.checked(1)
+    for name, value in told.items():
+        with pytest.raises(ValueError, match=name):
+            NewStudy(name="a", robot="b", policy="0" * 64, **told | {name: value + 1})
+
+
+def test_the_seed_of_a_plan_reaches_all_that_is_random(tmp_path: Path) -> None:
+    (tmp_path / "a.parquet").touch()
+    first, other = (graph(replace(small(), seed=seed), real=tmp_path) for seed in (0, 7))
+    fits = {name for name, cell in first.items() if cell.kind == "presysid"}
+    assert fits >= {"presysid-r1000", "presysid-fleet", "presysid-r1000-corrected", "presysid-real"}
+    for name in fits:
+        assert first[name].told["fits"]["seed"] == 0 and other[name].told["fits"]["seed"] == 7
+    kept = graph(small())["presysid-r1000"].told["fits"]
+    assert kept == small().presysid.told()  # folders of seed 0 stay as they are
+    assert replace(small(), seed=7).document()["fleet"]["seed"] == 7
 
 
 def test_words_of_a_training() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from commandline import pup
 from reports import Page
+from workshops import Workshop, do, opened, told
 
 from pup.errors import InputError
 from pup.files import write_json
@@ -26,50 +27,15 @@ from services.experiment.cells import Cell, graph
 from services.experiment.gather import gather
 from services.experiment.plan import Plan, small
 from services.experiment.report import estimated, write_report
-from services.experiment.run import CELLS, FILES, Outcome, failure, run_again, run_cells
+from services.experiment.run import CELLS, FILES, failure, run_again, run_cells
 from services.experiment.walking import conditioned
 
 ROBOT = RobotDescription.load("darwin_op2")
 
 
-def told(*_: Any) -> None:
-    """Nobody listens."""
-
-
-class Workshop:
-    """Kinds of cells that write down how often they are done, and stop or fail when told to."""
-
-    def __init__(self) -> None:
-        self.done: list[str] = []
-        self.stops: set[str] = set()
-        self.fails: set[str] = set()
-        self.breaks: set[str] = set()
-        self.chance: float = 0.0
-
-    def work(self, task: work.Task) -> dict[str, Any]:
-        name = task.cell.name
-        (task.out / "half").touch()
-        if name in self.stops:
-            raise KeyboardInterrupt
-        if name in self.fails:
-            raise InputError("it cannot be done")
-        if name in self.breaks:
-            raise RuntimeError("the disk is full")
-        self.done.append(name)
-        for left in work.LEFT.get(task.cell.kind, ()):
-            write_json(task.out / left, {})
-        return {"of": name, "chance": self.chance}
-
-
 @pytest.fixture
 def workshop(monkeypatch: pytest.MonkeyPatch) -> Workshop:
-    shop = Workshop()
-    monkeypatch.setattr("services.experiment.run.KINDS", dict.fromkeys(work.KINDS, shop.work))
-    return shop
-
-
-def do(cells: dict[str, Cell], out: Path) -> dict[str, Outcome]:
-    return run_cells(cells, out, places.OneByOne, told)
+    return opened(monkeypatch)
 
 
 def test_cells_are_done_once_and_again_when_something_changed(
@@ -83,7 +49,7 @@ def test_cells_are_done_once_and_again_when_something_changed(
     assert do(cells, tmp_path) == {} and len(workshop.done) == len(cells)
     plan = replace(small(), trials=replace(small().trials, landscape=8))
     workshop.done.clear()
-    assert do(graph(plan), tmp_path) == {}
+    assert do(graph(plan), tmp_path, redo=True) == {}
     assert set(workshop.done) == {"landscape-forward-pup", "landscape-forward-up"}
     # What came of it is what it was, so that nothing that needs it is done again.
     (tmp_path / CELLS / "presysid-r1000" / FILES / "bounds.json").write_text("[]")
@@ -142,7 +108,7 @@ def test_what_needs_another_result_is_done_again(workshop: Workshop, tmp_path: P
     workshop.done.clear()
     workshop.chance = 1.0
     (tmp_path / CELLS / "presysid-r1000" / FILES / "result.json").unlink()
-    do(cells, tmp_path)
+    do(cells, tmp_path, redo=True)
     behind = {n for n, c in cells.items() if "presysid-r1000" in c.needs.values()}
     assert {"presysid-r1000", *behind} <= set(workshop.done)
     assert not any("r1001" in name for name in workshop.done)
@@ -293,6 +259,10 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert lines["forward: PUP by Nominal"]["holds"]
     assert lines["forward, diagnosed fleet: PUP by Nominal"]["holds"]
     assert lines["error held out is lower by (median)"]["value"] == pytest.approx(0.55)
+    assert all(line["planned"] == line["robots"] for line in lines.values())
+    # The control of each robot is trained on as long as what is corrected, not as for a fleet.
+    assert ratios["corrected / fleet"]["controlled"]
+    assert not ratios["diagnosed / fleet"]["controlled"] and "controlled" not in ratios["pup / up"]
     assert not [name for name in lines if "sideways: PUP by Nominal" in name]
     named = document["diagnosis"]["robots"]
     share = np.mean(["ground_compliance" in one["classes"] for one in named.values()])
@@ -311,7 +281,9 @@ def test_an_experiment_that_is_only_begun_is_reported_too(tmp_path: Path) -> Non
     failed = dict.fromkeys(cells, "needs record-r1000")
     document = gather(small(), cells, failed, tmp_path)
     write_json(tmp_path / "experiment.json", document)
-    assert document["acceptance"] == [] and document["bounds"] is None
+    assert {line["answer"] for line in document["acceptance"]} == {"incomplete"}
+    assert {line["planned"] for line in document["acceptance"]} == {2}
+    assert document["bounds"] is None
     write_report(document, tmp_path / "report.html")
     assert "needs record-r1000" in Page(tmp_path / "report.html").text
 

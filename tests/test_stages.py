@@ -178,6 +178,28 @@ def test_a_shipped_policy_is_started_from_where_there_is_one(
     assert start() == shipped  # of other parameters: it learns to see them
 
 
+def test_what_is_replayed_depends_on_the_physics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job that goes on by another pup keeps no bounds and no errors of the one before."""
+    from services import pipeline
+    from services.mission import Mission
+    from services.presysid_options import Options
+
+    (tmp_path / "presysid").mkdir()
+    shutil.copy(DARWIN.identified_path, tmp_path / "presysid" / "bounds.json")
+    job = pipeline._Job(DARWIN, (), Mission(Options(), 0, 0), tmp_path, idle())
+
+    def inputs() -> list[dict[str, str]]:
+        makers = job._presysid, job._replay
+        return [dict(make(job.first).inputs) for make in makers] + [dict(job._diagnosis().inputs)]
+
+    before = inputs()
+    assert inputs() == before
+    monkeypatch.setattr(pipeline, "MODEL", pipeline.MODEL + 1)
+    assert all(now != then for now, then in zip(inputs(), before, strict=True))
+
+
 def test_no_picture_has_anything_done_again(tmp_path: Path) -> None:
     """A removed curve would cost the training, whose folder is emptied before it is made again."""
     from services.mission import Mission

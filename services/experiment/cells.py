@@ -1,7 +1,7 @@
 """The cells of an experiment: runs that stand alone, each told by what it depends on."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def graph(plan: Plan, ready: Path | None = None, real: Path | None = None) -> di
       real: folder of recordings of a real robot, to be identified and diagnosed beside.
 
     Raises:
-      InputError: the robot cannot take part.
+      InputError: the robot cannot take part, or there is no policy in `ready` for what is walked.
     """
     return _Graph(plan, ready, real).cells()
 
@@ -75,6 +75,8 @@ class _Graph:
         self._cells: dict[str, Cell] = {}
 
     def cells(self) -> dict[str, Cell]:
+        if self.ready is not None:
+            self._check_shelf(self.ready)
         for seed in self.plan.seeds:
             self._record(seed)
         for seed in self.plan.seeds:
@@ -113,6 +115,7 @@ class _Graph:
             if unknown := [motion for motion in motions if motion not in known]:
                 raise InputError(f"{place}: {unknown[0]!r} is none of {', '.join(known)}")
         fitted = played.intersection(record.fitted or played)
+        self._check_folds(sum(motion.motion in fitted for motion in scripts))
         stages = set(map(self._stage, cells.values()))
         if not fitted and "presysid" in stages:
             raise InputError("record: no motion is of a type in fitted, which pre-sysID is given")
@@ -123,6 +126,16 @@ class _Graph:
                 "diagnosis: motions shares no type with fitted of record, to which corrected "
                 "robots are fitted; add one, or leave corrected and diagnosed out of stages"
             )
+
+    def _check_folds(self, scripts: int) -> None:
+        """Refuse more folds than there are recordings, known by the scripts that are fitted."""
+        seen = {"presysid": scripts, "fleet": scripts * len(self.plan.seeds)}
+        for name, most in seen.items():
+            if (folds := getattr(self.plan, name).folds) > most:
+                raise InputError(
+                    f"{name}: {folds} folds for {most} recordings of the types in fitted; use 2 to "
+                    "their number, or 0 for none"
+                )
 
     def _stage(self, cell: Cell) -> str:
         """Which stage a cell belongs to."""
@@ -171,7 +184,10 @@ class _Graph:
         self._add(Cell(FLEET, "pooled", needs, self._told(), self._given(), 1.0))
 
     def _fitted(self, fits: Fits) -> dict[str, Any]:
-        return self._told(fits=fits.told(), motions=self.plan.record.fitted)
+        return self._told(fits=self._seeded(fits), motions=self.plan.record.fitted)
+
+    def _seeded(self, fits: Fits) -> dict[str, Any]:
+        return replace(fits, seed=self.plan.seed).told()
 
     def _policy(self, walk: Walk, method: Method) -> None:
         name, train = f"policy-{walk.direction}-{method}", self.plan.train
@@ -190,6 +206,18 @@ class _Graph:
         told = self._told(method=method, direction=walk.direction, training=words, options=options)
         weight = 20 + options["steps"] / 5000 + 8 * options["pattern"]
         self._add(Cell(name, "policy", dict(needs), told, self._given(), weight))
+
+    def _check_shelf(self, ready: Path) -> None:
+        """Refuse a folder without policies, for then all would be trained, in days."""
+        if not ready.is_dir():
+            raise InputError(f"--policies {ready}: is no folder; name that of the policies")
+        walked = [(walk, method) for walk in self.plan.walks for method in walk.methods]
+        if walked and not any(self._shelf(*one) for one in walked):
+            walk, method = walked[0]
+            raise InputError(
+                f"--policies {ready}: holds no policy that walks in this plan, such as "
+                f"{walk.direction}/{method}/{CARD}; name their folder, or leave it out to train all"
+            )
 
     def _shelf(self, walk: Walk, method: Method) -> Path | None:
         """A policy that is trained already."""
@@ -289,7 +317,7 @@ class _Graph:
         told: dict[str, Any] = {"recordings": {file.name: sha256(file) for file in files}}
         given = self._given(recordings=str(folder.absolute()))
         told["motions"] = ()  # all
-        fits = self.plan.fleet.told() | {"compare": True}
+        fits = self._seeded(replace(self.plan.fleet, compare=True))
         self._add(Cell("presysid-real", "presysid", {}, self._told(fits=fits, **told), given, 1e5))
         plan = asdict(self.plan.diagnosis) | {"rivals": True, "rollouts": 0} | told
         self._add(Cell("diagnosis-real", "diagnosis", {}, self._told(**plan), given, 1e5))

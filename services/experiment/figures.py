@@ -26,7 +26,7 @@ from pup.sysid.figures import (
 )
 from pup.sysid.html import Drawing
 from services.experiment.statistics import best_so_far
-from services.experiment.verdicts import FLEETS
+from services.experiment.verdicts import ENOUGH, FLEETS, walking
 
 COLOURS = {"pup": VERMILLION, "up": AMBER, "robust": BLUE, "nominal": SOFT}
 NAMES = {
@@ -144,17 +144,19 @@ def per_robot(walks: Mapping[str, Any], end: str) -> Drawing:
 def searches(part: Mapping[str, Any]) -> Drawing:
     """The best walk so far over trials, as a share of what PUP comes after all of them.
 
+    Robots on which PUP does not walk are left out: there is nothing to be a share of.
+
     Args:
       part: one direction of the document.
     """
     figure = new_figure(WIDTH, 2.9)
     axes = figure.subplots()
-    goals = {r: float(np.mean(w["distance"])) for r, w in part["walks"]["pup"].items()}
+    far = walking(part["walks"])
     for arm, told in part["searches"].items():
         shares = [
-            np.array(best_so_far(distances)) / goals[robot]
+            np.array(best_so_far(distances)) / far[robot]
             for robot, distances in told.items()
-            if distances and goals.get(robot, 0) > 0
+            if distances and robot in far
         ]
         if not shares:
             continue
@@ -165,7 +167,7 @@ def searches(part: Mapping[str, Any]) -> Drawing:
         low, high = np.quantile(drawn, [0.25, 0.75], axis=0)
         axes.fill_between(trial, low, high, color=colour, alpha=0.1, lw=0)
         axes.plot(trial, np.median(drawn, axis=0), dash, color=colour, label=NAMES[arm])
-    axes.axhline(0.95, color=PALE, lw=1)
+    axes.axhline(ENOUGH, color=PALE, lw=1)
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("trials")

@@ -4,18 +4,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pup.files import read_json, sha256
+from pup.policy.bundle import CARD
 from pup.policy.shape import Method
 from services.experiment.cells import DIAGNOSED, DIAGNOSED_FLEET, FLEET, Cell
 from services.experiment.diagnosed import diagnoses
-from services.experiment.plan import Plan, Walk
+from services.experiment.plan import Plan, Walk, meant
 from services.experiment.run import Order, digest
-from services.experiment.verdicts import acceptance, of_direction
+from services.experiment.verdicts import FITTED, acceptance, of_direction
 from services.provenance import ALSO, engine, now
 
 SCHEMA = 1
 FURTHER = ("own", "corrected")
 PRIOR = "-prior"
-FITTED = "+fitted"
 
 
 def gather(
@@ -34,16 +35,18 @@ def gather(
     """
     done = {name: Order(cell, out) for name, cell in cells.items() if name not in failed}
     found = {name: order.result() for name, order in done.items()}
-    directions = {str(walk.direction): _direction(plan, walk, found) for walk in plan.walks}
+    directions = {str(w.direction): _direction(plan, w, cells, found) for w in plan.walks}
+    budgets = _budgets(plan)
     for part in directions.values():
-        part["statistics"] = of_direction(part, plan.seed)
-    diagnosed = diagnoses(plan, found)
+        part["statistics"] = of_direction(part, budgets)
+    diagnosed = diagnoses(plan, cells, found)
     return {
         "schema": SCHEMA,
         "robot": plan.robot,
         "plan": plan.document(),
         "acceptance": acceptance(directions, diagnosed),
         "directions": directions,
+        "policies": _policies(plan, done, found),
         "bounds": _bounds(plan, found, FLEET, ""),
         "bounds_diagnosed": _bounds(plan, found, DIAGNOSED_FLEET, "-corrected"),
         "diagnosis": diagnosed,
@@ -68,8 +71,47 @@ def _cell(order: Order) -> dict[str, Any]:
     }
 
 
-def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Walks and searches of a direction, by arm and robot.
+def _budgets(plan: Plan) -> dict[str, int]:
+    """Steps of policies that are trained on, by the end of their arms."""
+    words = dict.fromkeys(FURTHER, plan.train.further) | {DIAGNOSED: plan.train.diagnosed}
+    return {end: int(meant(told, further=True)["steps"]) for end, told in words.items()}
+
+
+def _policies(
+    plan: Plan, done: Mapping[str, Order], found: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Where each policy is from: given or trained here, for how many steps, on which bounds."""
+    policies = {name: o for name, o in done.items() if o.cell.kind == "policy"}
+    fleet = sha256(done[FLEET].files / "bounds.json") if FLEET in done else None
+    fits = _own_fits(plan, found, "")
+    told = {}
+    for name, order in policies.items():
+        card, result = read_json(order.files / "policy" / CARD), found[name]
+        options = card.get("provenance", {}).get("options", {})
+        bounds, given = card.get("bounds_sha256"), result["ready"]
+        other = given and None not in (bounds, fleet) and bounds != fleet
+        told[name] = {
+            "given": given,
+            "steps": options.get("steps") if result["steps"] is None else result["steps"],
+            "bounds_sha256": bounds,
+            "other_bounds": other,
+            "outside": _outside(card, fits) if other else {},
+        }
+    return told
+
+
+def _outside(card: Mapping[str, Any], fits: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Share of the robots whose own fit lies outside of a policy's bounds, by parameter."""
+    names = ("parameters", "parameter_lower", "parameter_upper")
+    ranges = zip(*(card[name] for name in names), strict=True)
+    bounds = [{"name": name, "lower": low, "upper": high} for name, low, high in ranges]
+    return {name: 1 - share for name, share in _inside(bounds, fits).items()}
+
+
+def _direction(
+    plan: Plan, walk: Walk, cells: Mapping[str, Cell], found: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Walks and searches of a direction, by arm and robot, and robots that arms are planned for.
 
     An arm is a method, whose eta was chosen by trials, with what is different: `+prior` where the
     search began with simulated rollouts, `+own` and `+corrected` where the policy was trained on in
@@ -78,6 +120,7 @@ def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, An
     """
     walks: dict[str, Any] = {}
     searches: dict[str, Any] = {}
+    planned: dict[str, list[str]] = {}
     for seed in plan.seeds[: walk.robots]:
         start = f"trials-r{seed}-{walk.direction}-"
         named = {str(m): f"{start}{m}" for m in walk.methods}
@@ -85,9 +128,15 @@ def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, An
         named |= {f"{m}+{DIAGNOSED}": f"{start}{m}-{DIAGNOSED}" for m in walk.methods}
         named |= {f"{Method.PUP}+{way}": f"{start}{way}" for way in FURTHER}
         for arm, name in named.items():
+            if name not in cells:
+                continue
+            robot = f"r{seed}"
+            planned.setdefault(arm, []).append(robot)
+            if "bounds" in cells[name].needs and not name.endswith(PRIOR):
+                planned.setdefault(f"{arm}{FITTED}", []).append(robot)
             if name not in found:
                 continue
-            result, robot = found[name], f"r{seed}"
+            result = found[name]
             if result["chosen"]["distance"]:
                 walks.setdefault(arm, {})[robot] = result["chosen"]
             fitted = result["fitted"]
@@ -100,7 +149,7 @@ def _direction(plan: Plan, walk: Walk, found: Mapping[str, Any]) -> dict[str, An
             ]
             if fitted is not None:
                 searches.setdefault(arm, {})[robot] = searched
-    return {"walks": walks, "searches": searches}
+    return {"walks": walks, "searches": searches, "planned": planned}
 
 
 def _bounds(
@@ -110,16 +159,23 @@ def _bounds(
     if fleet_name not in found:
         return None
     fleet = found[fleet_name]
-    robots = {}
-    for seed in plan.seeds:
-        if (own := found.get(f"presysid-r{seed}{own_suffix}")) is not None:
-            robots[f"r{seed}"] = {p["name"]: p["nominal"] for p in own["parameters"]}
+    robots = _own_fits(plan, found, own_suffix)
     return {
         "parameters": fleet["parameters"],
         "loss": fleet["loss"],
         "histories": fleet["histories"],
         "robots": robots,
         "inside": _inside(fleet["parameters"], robots),
+    }
+
+
+def _own_fits(plan: Plan, found: Mapping[str, Any], suffix: str) -> dict[str, dict[str, float]]:
+    """Fitted parameters of each robot, by name."""
+    fits = {f"r{seed}": found.get(f"presysid-r{seed}{suffix}") for seed in plan.seeds}
+    return {
+        robot: {p["name"]: p["nominal"] for p in own["parameters"]}
+        for robot, own in fits.items()
+        if own is not None
     }
 
 

@@ -6,12 +6,14 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, NoReturn, get_type_hints
+from typing import Any, NoReturn, get_args, get_type_hints
 
 from pup.errors import InputError
 from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
+from pup.robot import Actuator
 from pup.robot_toml import Table, read_text
+from services.gateway.limits import ETAS, HORIZON, REPEATS, SEEDS, TRIALS
 from services.presysid_options import Options as Fits
 
 LIMIT = 2**18  # bytes of a plan
@@ -20,9 +22,21 @@ STAGES = (
     *("record", "presysid", "policy", "trials", "prior", "diagnosis", "corrected", "diagnosed"),
 )
 """What can be left out; what a stage needs is done in any case."""
-NOT_SAID = ("start", "fitted_to")
-"""Of fits, what is the experiment's to say: which files, and what was diagnosed."""
+PARTS = ("record", "presysid", "fleet", "train", "trials", "diagnosis")
+"""Tables of a plan's file, besides those of its walks."""
+FITTED = ("presysid", "fleet")
+"""Parts that tell of fits."""
+NOT_SAID = ("start", "fitted_to", "seed")
+"""Of fits, what is the experiment's to say: which files, what was diagnosed, and what is drawn."""
 FITS = Fits(generations=100, subset_generations=50)
+MOST = {
+    "trials": TRIALS,
+    "prior": TRIALS,
+    "repeats": REPEATS,
+    "horizon": HORIZON,
+    "landscape": ETAS,
+}
+"""Of trials: what the gateway's studies take."""
 LEAST = {"generations": 1, "population": 4, "subsets": 1, "subset_generations": 1}
 """Of fits, as for `pup presysid`."""
 
@@ -205,6 +219,8 @@ class Plan:
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
             raise InputError("seeds: name each concealed robot once, by a whole number from 0")
+        if (largest := max(self.seed, *self.seeds)) >= SEEDS:
+            raise InputError(f"seed {largest} is too large; seeds must be below {SEEDS}")
         named = [walk.direction for walk in self.walks]
         if len(set(named)) < len(named):
             raise InputError("walk: a direction stands twice; name each once")
@@ -222,10 +238,13 @@ class Plan:
             )
         if min(self.trials.trials, self.trials.prior, self.trials.repeats) < 1:
             raise InputError("trials: trials, prior and repeats must be 1 or more")
+        for name, most in MOST.items():
+            if (told := getattr(self.trials, name)) > most:
+                raise InputError(f"trials: {name} is {told:g}; it must be {most} at most")
         if min(self.trials.horizon, self.diagnosis.seconds) <= 0:
             raise InputError("trials: horizon, and seconds of diagnosis, must be above 0")
-        for name, fits in (("presysid", self.presysid), ("fleet", self.fleet)):
-            _check(name, fits)
+        for name in FITTED:
+            _check(name, getattr(self, name))
         if self.diagnosis.effects < 1:
             raise InputError(
                 "diagnosis: effects must be 1 or more; to look for none, leave it out of stages"
@@ -235,7 +254,10 @@ class Plan:
 
     def document(self) -> dict[str, Any]:
         """As JSON values."""
-        return asdict(self)
+        told = asdict(self)
+        for name in FITTED:
+            told[name]["seed"] = self.seed
+        return told
 
     def of(self, seeds: Sequence[int] | None, methods: Sequence[str] | None) -> "Plan":
         """The plan for other robots, or for some of its methods alone.
@@ -262,6 +284,16 @@ def _check(name: str, fits: Fits) -> None:
             raise InputError(f"{name}: {key} must be {least} or more")
     if not 0 < fits.fraction <= 1:
         raise InputError(f"{name}: fraction must be above 0, and 1 at most")
+    if fits.actuator not in (known := get_args(Actuator)):
+        raise InputError(f"{name}: actuator {fits.actuator!r} is none of {', '.join(known)}")
+    if fits.folds == 1:
+        raise InputError(
+            f"{name}: 1 in folds would leave nothing to fit; use 2 or more, or 0 for none"
+        )
+    try:
+        fits.check(())
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
 
 
 def small() -> Plan:
@@ -290,10 +322,11 @@ def read_plan(file: Path) -> Plan:
     if table.integer("schema") != 1:
         raise table.mistake("schema", "not 1; this version reads schema = 1 only")
     usual = Plan()
-    told: dict[str, Any] = {
-        name: _part(table.table(name), getattr(usual, name))
-        for name in ("record", "presysid", "fleet", "train", "trials", "diagnosis")
-    }
+    parts = {name: table.table(name) for name in PARTS}
+    for name in FITTED:
+        if parts[name].has("seed"):
+            raise parts[name].mistake("seed", "is that of the plan; write it above the tables")
+    told: dict[str, Any] = {name: _part(part, getattr(usual, name)) for name, part in parts.items()}
     walks = table.tables("walk")
     if walks:
         told["walks"] = tuple(_walk(walk, file) for walk in walks)

@@ -10,7 +10,8 @@ from pup.files import write_atomic
 from pup.sysid.figures import LABELS, convergence, drawing_style
 from pup.sysid.html import Column, Html, figure, page, table, tag
 from services.experiment import figures
-from services.experiment.verdicts import FLEETS
+from services.experiment.statistics import FEW
+from services.experiment.verdicts import FLEETS, budget, walking
 
 MISSING = "-"
 
@@ -34,7 +35,8 @@ def estimated(told: Mapping[str, Any] | None, digits: int = 2) -> str:
     interval = told.get("ci90")
     if not interval:
         return value
-    low, high = ("∞" if end is None else f"{end:.{digits}f}" for end in interval)
+    ends = zip(interval, ("-∞", "∞"), strict=True)
+    low, high = (without if end is None else f"{end:.{digits}f}" for end, without in ends)
     return f"{value} ({low} to {high})"
 
 
@@ -45,12 +47,15 @@ def _content(told: Mapping[str, Any]) -> Iterator[Html]:
         "p",
         f"{len(plan['seeds'])} virtual robots of {told['robot']} with physics that training never "
         "saw, through the real chain: recordings from the servo bus, bounds, policies, trials over "
-        "ZeroMQ. Intervals are 90 %, of robots drawn with replacement.",
+        "ZeroMQ. Intervals are 90 %, for other robots of their kind: of shares by Clopper and "
+        "Pearson, of means by Student, of ratios by Fieller, of medians from the order of robots. "
+        f"What fewer than {FEW} robots say is indicative.",
         class_="lead",
     )
-    if any(part["walks"] for part in told["directions"].values()) or told["diagnosis"]["robots"]:
+    if told["acceptance"]:
         yield tag("h2", "What was to be shown")
         yield from _acceptance(told)
+    yield from _other_bounds(told)
     for direction, part in told["directions"].items():
         if not part["walks"]:
             continue
@@ -79,14 +84,47 @@ def _acceptance(told: Mapping[str, Any]) -> Iterator[Html]:
     rows = [
         (
             line["line"],
-            estimated(line) if line["value"] is not None else "∞",
-            str(line["robots"]),
+            _found(line),
+            _of_planned(line),
             f"{line['bar']:g}",
-            "holds" if line["holds"] else "does not hold",
+            line["answer"] + (", indicative" if line["indicative"] else ""),
         )
         for line in told["acceptance"]
     ]
     yield table("Bars, and what was found", columns, rows)
+    yield tag(
+        "p",
+        "A line holds where the whole interval is above its bar; it is not shown where the number "
+        "is and the interval is not, and fails where the number is below. It is incomplete where "
+        "robots are missing that were planned.",
+    )
+
+
+def _found(line: Mapping[str, Any]) -> str:
+    """A number of a line; there is no ratio to a mean of nothing."""
+    return "other does not walk" if line["robots"] and line["value"] is None else estimated(line)
+
+
+def _of_planned(told: Mapping[str, Any]) -> str:
+    return f"{told['robots']} of {told['planned']}"
+
+
+def _other_bounds(told: Mapping[str, Any]) -> Iterator[Html]:
+    """A sentence for policies that were given and trained on bounds that are not the fleet's."""
+    together: dict[str, list[str]] = {}
+    for name, policy in told["policies"].items():
+        if policy["other_bounds"]:
+            together.setdefault(policy["bounds_sha256"], []).append(name)
+    for bounds, names in together.items():
+        outside = told["policies"][names[0]]["outside"]
+        by_name = ", ".join(f"{name} {share:.0%}" for name, share in outside.items() if share)
+        share = f"{np.mean(list(outside.values())):.0%}" if outside else "an unknown share"
+        yield tag(
+            "p",
+            f"{', '.join(names)}: given, and trained on bounds ({bounds[:12]}) that are not this "
+            f"fleet's; {share} of the parameters that were fitted to its robots lie outside of "
+            f"these{f' ({by_name})' if by_name else ''}, where PUP's eta is extrapolated.",
+        )
 
 
 def _walked(directions: Mapping[str, Any]) -> Iterator[Html]:
@@ -127,11 +165,18 @@ def _direction(part: Mapping[str, Any]) -> Iterator[Html]:
                 figures.per_robot(part["walks"], end),
                 f"Mean distance of each method on each robot{words}.",
             )
-    rows = [(f"farther than {name}", estimated(one)) for name, one in told["above"].items()]
-    rows += [(name, estimated(one)) for name, one in told["ratios"].items()]
+    compared = {f"farther than {name}": one for name, one in told["above"].items()}
+    compared |= {f"{name}{budget(one)}": one for name, one in told["ratios"].items()}
+    rows = [(name, estimated(one), _of_planned(one)) for name, one in compared.items()]
     if rows:
         columns = [Column("PUP against others", "words"), Column("Share or ratio", "number")]
-        yield table("Shares of robots, and ratios of mean distances", columns, rows)
+        columns += [Column("Robots", "number")]
+        yield table(
+            "Shares of robots, and ratios of mean distances. Farther: by more than two standard "
+            "errors of the difference of this robot's walks, and not backwards",
+            columns,
+            rows,
+        )
     yield from _searches(part)
 
 
@@ -143,28 +188,42 @@ def _searches(part: Mapping[str, Any]) -> Iterator[Html]:
     told = part["statistics"]["needed"]
     if not told:
         return
-    goals = [float(np.mean(w["distance"])) for w in part["walks"]["pup"].values()]
-    if max(goals) > 0:
+    left_out = _not_walking(told)
+    if walking(part["walks"]):
         yield figure(
             figures.searches(part),
             "Best walk so far over trials, for each search.",
             "Median over robots of the best walk so far; bands: the middle half. A best walk is "
-            "one walk, and lucky: the tables tell what chosen etas come to.",
+            f"one walk, and lucky: the tables tell what chosen etas come to.{left_out}",
         )
     columns = [Column("Search", "words"), Column("Trials", "number")]
-    columns += [Column("Needed (median)", "number"), Column("Robots that got there", "number")]
+    columns += [Column("Needed (median)", "number"), Column("Share that got there", "number")]
+    columns += [Column("Robots", "number")]
     rows = [
         (
             figures.NAMES.get(arm, arm),
             str(one["trials"]),
             MISSING if one["median"] is None else f"{one['median']:g}",
             estimated(one["reached"]),
+            str(one["reached"]["robots"]),
         )
         for arm, one in told.items()
     ]
     yield table(
-        "Trials until a walk came as far as 95 % of PUP's distance after all trials", columns, rows
+        f"Trials until a walk came as far as 95 % of PUP's distance after all trials.{left_out}",
+        columns,
+        rows,
     )
+
+
+def _not_walking(needed: Mapping[str, Any]) -> str:
+    """Which robots are not counted in what is a share of PUP's distance, and why."""
+    left_out = sorted({robot for one in needed.values() for robot in one["not_walking"]})
+    counted = {robot for one in needed.values() for robot in one["robots"]}
+    if not left_out:
+        return ""
+    of = f"{len(left_out)} of {len(left_out) + len(counted)} robots"
+    return f" Left out, as PUP does not walk there after them: {of}, {', '.join(left_out)}."
 
 
 def _bounds(told: Mapping[str, Any]) -> Iterator[Html]:
@@ -206,7 +265,9 @@ def _diagnosis(told: Mapping[str, Any]) -> Iterator[Html]:
         yield figure(
             figures.before_after(held, "error on motions left out, mrad"),
             "Error on motions left out of each robot, before and after its diagnosis.",
-            f"Lower by {estimated(found['improvement'])} (median share).",
+            f"Lower by {estimated(found['improvement'])} (median share of "
+            f"{found['improvement']['robots']} robots; {found['undetermined']} undetermined, which "
+            "count as 0).",
         )
     for direction, part in told["directions"].items():
         yield from _without_trials(direction, part["walks"])
@@ -283,6 +344,24 @@ def _provenance(told: Mapping[str, Any]) -> Iterator[Html]:
     failures = [f"{name}: {why}" for name, why in told["failed"].items()] + stopped
     yield tag("h3", "What failed")
     yield tag("ul", *(tag("li", line) for line in failures or ["nothing"]))
+    yield from _policies(told["policies"])
     columns = [Column("Cell"), Column("Took [s]", "number"), Column("Digest of what it found")]
     rows = [(name, f"{c['seconds']:,.0f}", c["digest"][:16]) for name, c in cells.items()]
     yield table("Cells; `pup experiment --cell NAME` does one again and compares", columns, rows)
+
+
+def _policies(told: Mapping[str, Any]) -> Iterator[Html]:
+    if not told:
+        return
+    columns = [Column("Policy"), Column("Came", "words"), Column("Steps", "number")]
+    columns += [Column("Bounds")]
+    rows = [
+        (
+            name,
+            "given" if policy["given"] else "trained here",
+            MISSING if policy["steps"] is None else f"{policy['steps']:,}",
+            (policy["bounds_sha256"] or MISSING)[:16],
+        )
+        for name, policy in told.items()
+    ]
+    yield table("Policies, with the digest of the bounds that each was trained on", columns, rows)

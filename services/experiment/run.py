@@ -18,12 +18,13 @@ from typing import Any
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
 from services.experiment.cells import Cell, chosen
+from services.experiment.inputs import different
 from services.experiment.work import KINDS, LEFT, RESULT, Task
 from services.failures import ERROR, SHOWN, caught, lost, mended, named
 from services.places import Pools
 from services.progress import Told
 from services.provenance import ALSO, engine, now
-from services.stages import Journal, Stage
+from services.stages import JOURNAL, Journal, Stage
 
 CELLS, AGAIN = "cells", "again"
 NEEDS = "needs "
@@ -41,11 +42,13 @@ class Order:
       cell: which.
       out: folder of the experiment.
       place: name of the folder in it for this cell, of CELLS or AGAIN.
+      redo: whether what it found from other inputs may be deleted.
     """
 
     cell: Cell
     out: Path
     place: str = CELLS
+    redo: bool = False
 
     @property
     def folder(self) -> Path:
@@ -59,19 +62,31 @@ class Order:
 
     def stage(self) -> Stage:
         """The cell as the journal has it; what it needs must be done."""
-        told = json.dumps(self.cell.told, sort_keys=True)
-        inputs = {"kind": self.cell.kind, "told": told}
-        inputs |= {part: sha256(f / RESULT) for part, f in self._needed().items()}
+        inputs = self._inputs(self._needed())
         left = (RESULT, *LEFT.get(self.cell.kind, ()))
         files = tuple(f"{FILES}/{name}" for name in left)
         return Stage(self.cell.name, inputs, files, self._work, folder=FILES, remade=True)
+
+    def _inputs(self, needed: Mapping[str, Path]) -> dict[str, str]:
+        told = json.dumps(self.cell.told, sort_keys=True)
+        found = {part: sha256(f / RESULT) for part, f in needed.items()}
+        return {"kind": self.cell.kind, "told": told} | found
 
     @property
     def done(self) -> bool:
         """Whether it is done, from what those that it needs have found since."""
         if not all((f / RESULT).is_file() for f in self._needed().values()):
             return False
-        return (self.folder / "run.json").is_file() and Journal(self.folder).kept(self.stage())
+        return (self.folder / JOURNAL).is_file() and Journal(self.folder).kept(self.stage())
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """What is other than when it was done, as far as that is known; none where it is not."""
+        if not ((self.folder / JOURNAL).is_file() and (self.files / RESULT).is_file()):
+            return ()
+        there = {part: f for part, f in self._needed().items() if (f / RESULT).is_file()}
+        before = Journal(self.folder).inputs(self.cell.name)
+        return different(before, self._inputs(there), self.cell.needs)
 
     def result(self) -> dict[str, Any]:
         """What it found."""
@@ -117,6 +132,7 @@ class _Agenda:
 
     Attributes:
       cells: all, each after those that it needs.
+      redo: whether what was found from other inputs may be deleted.
       left: those of which nothing is known yet.
       done: those that are there.
       failed: those that are not to be had, and what became of them.
@@ -124,8 +140,8 @@ class _Agenda:
       spent: of it, what is done or failed.
     """
 
-    def __init__(self, cells: Mapping[str, Cell], out: Path) -> None:
-        self.cells, self.out = cells, out.absolute()
+    def __init__(self, cells: Mapping[str, Cell], out: Path, redo: bool) -> None:
+        self.cells, self.out, self.redo = cells, out.absolute(), redo
         self.left, self.done, self.failed = dict(cells), set[str](), dict[str, Outcome]()
         self.whole, self.spent = sum(cell.weight for cell in cells.values()), 0.0
         self._way: dict[str, float] = {}
@@ -142,7 +158,7 @@ class _Agenda:
             if missing := [need for need in cell.needs.values() if need in self.failed]:
                 self.settle(self.left.pop(cell.name), Outcome(error=f"{NEEDS}{missing[0]}"))
             elif self.done.issuperset(cell.needs.values()):
-                order = Order(self.left.pop(cell.name), self.out)
+                order = Order(self.left.pop(cell.name), self.out, redo=self.redo)
                 if order.done:
                     self.done.add(cell.name)
                     self.whole -= cell.weight
@@ -164,7 +180,9 @@ class _Agenda:
         return self.spent / self.whole if self.whole else 1.0
 
 
-def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) -> dict[str, Outcome]:
+def run_cells(
+    cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told, redo: bool = False
+) -> dict[str, Outcome]:
     """Do the cells that are not done.
 
     Args:
@@ -172,11 +190,12 @@ def run_cells(cells: Mapping[str, Cell], out: Path, pools: Pools, tell: Told) ->
       out: folder of the experiment.
       pools: of what does several at once.
       tell: told how many are done.
+      redo: whether what was found from other inputs may be deleted; else such cells fail.
 
     Returns:
       The cells that failed, or could not be done as others had failed, and what became of them.
     """
-    agenda, running, note = _Agenda(cells, out), 0, ""
+    agenda, running, note = _Agenda(cells, out, redo), 0, ""
     with closing(pools(work_on)) as pool:
         while True:
             for order in agenda.due():
@@ -198,12 +217,43 @@ def work_on(order: Order) -> Outcome:
     begin = time.monotonic()
     try:
         order.folder.mkdir(parents=True, exist_ok=True)
+        _spare(order)
         Journal(order.folder).once(order.stage())
     except Exception as error:  # whatever it is, other cells go on
         why = caught(order.folder, error)
         return Outcome(error=why, mistaken=isinstance(error, InputError))
     mended(order.folder)
     return Outcome(time.monotonic() - begin)
+
+
+def _spare(order: Order) -> None:
+    """Refuse to delete what was found; `refuse_changed` does not know what others will find."""
+    if not order.redo and (changed := order.changed):
+        raise InputError(
+            f"is done, with another {', '.join(changed)}; --redo, without --cell, does it anew"
+        )
+
+
+def refuse_changed(cells: Mapping[str, Cell], out: Path, redo: str) -> None:
+    """Refuse cells that are done, but from other inputs than are asked for now.
+
+    What they found would be deleted, for a plan that was changed or an option that was forgotten.
+
+    Args:
+      cells: of which each would be done if it were not.
+      out: folder of the experiment.
+      redo: how to have them done anew all the same, in words.
+
+    Raises:
+      InputError: there are such cells.
+    """
+    orders = [Order(cell, out.absolute()) for cell in cells.values()]
+    if changed := {o.cell.name: f"another {', '.join(o.changed)}" for o in orders if o.changed}:
+        raise InputError(
+            f"{out}: {len(changed)} finished cells were done with other inputs, and what they "
+            f"found would be deleted: {named(changed)}; give the options and the plan of before, "
+            f"use another --out, or {redo}"
+        )
 
 
 def failure(failed: Mapping[str, Outcome], out: Path) -> InputError | ChildProcessError:
@@ -220,13 +270,24 @@ def failure(failed: Mapping[str, Outcome], out: Path) -> InputError | ChildProce
     return _raised(line, all(told.mistaken for told in own.values()))
 
 
+def with_needed(cells: Mapping[str, Cell], name: str) -> dict[str, Cell]:
+    """A cell, after those that it needs.
+
+    Raises:
+      InputError: there is no such cell.
+    """
+    if name not in cells:
+        raise InputError(f"--cell {name}: there is none; {', '.join(list(cells)[:SHOWN])}, ...")
+    return chosen(cells, [name])
+
+
 def run_again(
     cells: Mapping[str, Cell], name: str, out: Path, pools: Pools, tell: Told
 ) -> dict[str, Any]:
     """Do one cell anew, beside what it left before, and compare.
 
     Cells that it needs are done first where they are not. One that was never done is done twice,
-    so that there is something to compare.
+    so that there is something to compare. Nothing is deleted that was done from other inputs.
 
     Args:
       cells: of the experiment.
@@ -242,14 +303,11 @@ def run_again(
       InputError: there is no such cell, or what it is given is bad.
       ChildProcessError: it fails otherwise.
     """
-    if name not in cells:
-        raise InputError(f"--cell {name}: there is none; {', '.join(list(cells)[:SHOWN])}, ...")
-    needed = chosen(cells, [name])
-    failed = run_cells(needed, out, pools, tell)
+    failed = run_cells(with_needed(cells, name), out, pools, tell)
     if failed:
         raise failure(failed, out)
     first = Order(cells[name], out.absolute())
-    second = Order(cells[name], out.absolute(), AGAIN)
+    second = Order(cells[name], out.absolute(), AGAIN, redo=True)
     if second.done:
         shutil.rmtree(second.folder)
     with closing(pools(work_on)) as pool:

@@ -1,6 +1,7 @@
 """The verb: from options to a plan, to its cells, to what they found."""
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,11 @@ from pup.errors import InputError
 from pup.files import write_json
 from pup.policy.shape import Method
 from services import places
-from services.experiment.cells import graph
+from services.experiment.cells import Cell, graph
 from services.experiment.plan import Plan, read_plan, small
-from services.experiment.run import failure, run_again, run_cells
+from services.experiment.run import failure, refuse_changed, run_again, run_cells, with_needed
 from services.experiment.work import quiet
+from services.held import held
 from services.progress import counted
 
 EXPERIMENT, REPORT = "experiment.json", "report.html"
@@ -22,8 +24,10 @@ def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
     """Do an experiment, or one of its cells again.
 
     Raises:
-      InputError: the plan cannot be done, or some of its cells failed for bad input alone.
+      InputError: the plan cannot be done, what was done for another would be deleted, or some of
+        its cells failed for bad input alone.
       ChildProcessError: some failed otherwise.
+      FailedError: another process works in the folder.
     """
     from services.experiment.gather import gather
     from services.experiment.report import write_report
@@ -36,17 +40,28 @@ def run(options: argparse.Namespace, out: Path) -> dict[str, Any]:
             f"nothing to do in {', '.join(plan.stages) or 'no stage'}: a diagnosed fleet is of two "
             "robots or more, the corrected are of walks of PUP; name other stages or seeds"
         )
-    with places.cases(options) as (pools, _), counted("experiment") as tell:
-        if options.cell is not None:
-            return run_again(cells, options.cell, out, pools, tell)
-        failed = run_cells(cells, out, pools, tell)
-    why = {name: told.error for name, told in failed.items()}
-    document = gather(plan, cells, why, out.absolute())
-    write_json(out / EXPERIMENT, document)
-    write_report(document, out / REPORT)
+    wanted = cells if options.cell is None else with_needed(cells, options.cell)
+    with held(out):
+        _keep(wanted, options, out)
+        with places.cases(options) as (pools, _), counted("experiment") as tell:
+            if options.cell is not None:
+                return run_again(cells, options.cell, out, pools, tell)
+            failed = run_cells(cells, out, pools, tell, options.redo)
+        why = {name: told.error for name, told in failed.items()}
+        document = gather(plan, cells, why, out.absolute())
+        write_json(out / EXPERIMENT, document)
+        write_report(document, out / REPORT)
     if failed:
         raise failure(failed, out)
     return {"experiment": document, "report": str(out / REPORT)}
+
+
+def _keep(cells: Mapping[str, Cell], options: argparse.Namespace, out: Path) -> None:
+    """Refuse to delete what was done for another plan, unless that is asked for."""
+    if options.cell is not None:
+        refuse_changed(cells, out, "do them anew with --redo and without --cell")
+    elif not options.redo:
+        refuse_changed(cells, out, "do them anew with --redo")
 
 
 def plan_of(options: argparse.Namespace) -> Plan:

@@ -16,6 +16,7 @@ from pup.errors import InputError
 from pup.transfer.study import FAILURES, Gate, StudyState
 from pup.transfer.study import StudySettings as Defaults
 from pup.transfer.trial import Purpose, TrialState
+from services.gateway.limits import ETAS, HORIZON, REPEATS, SEEDS, TRIALS
 from services.gateway.names import WHOLE
 from services.gateway.records import Row
 
@@ -41,9 +42,9 @@ class Strict(BaseModel):
 class SimulatedRollouts(Strict):
     """Distances of the policy in simulation, a row for each mu, a column for each eta."""
 
-    eta: Annotated[list[Eta], Field(min_length=2, max_length=4096)]
+    eta: Annotated[list[Eta], Field(min_length=2, max_length=ETAS)]
     distance: Annotated[
-        list[Annotated[list[Number], Field(min_length=2, max_length=4096)]],
+        list[Annotated[list[Number], Field(min_length=2, max_length=ETAS)]],
         Field(min_length=1, max_length=4096),
     ]
 
@@ -72,12 +73,12 @@ class NewStudy(Strict):
     policy: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of policy.json.")]
     lower: Eta = list(Defaults.lower)
     upper: Eta = list(Defaults.upper)
-    trials: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.trials
-    initial: Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] = Defaults.initial
+    trials: Annotated[int, Field(ge=1, le=TRIALS), WITHOUT_FRACTION] = Defaults.trials
+    initial: Annotated[int, Field(ge=1, le=TRIALS), WITHOUT_FRACTION] = Defaults.initial
     least_gain: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = Defaults.least_gain
-    repeats: Annotated[int, Field(ge=0, le=100), WITHOUT_FRACTION] = Defaults.repeats
+    repeats: Annotated[int, Field(ge=0, le=REPEATS), WITHOUT_FRACTION] = Defaults.repeats
     compare: Annotated[list[Eta], Field(max_length=16)] = []
-    horizon: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = Defaults.horizon
+    horizon: Annotated[float, Field(gt=0, le=HORIZON, allow_inf_nan=False)] = Defaults.horizon
     lease: Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] = Defaults.lease
     failures: Annotated[
         Annotated[int, Field(ge=1, le=1000), WITHOUT_FRACTION] | None,
@@ -86,7 +87,7 @@ class NewStudy(Strict):
     gate: Annotated[Gate, Field(strict=False)] = Defaults.gate
     agent: Name | None = None
     warm_start: bool = Defaults.warm_start
-    seed: Annotated[int, Field(ge=0, lt=2**31), WITHOUT_FRACTION] = Defaults.seed
+    seed: Annotated[int, Field(ge=0, lt=SEEDS), WITHOUT_FRACTION] = Defaults.seed
     simulated: SimulatedRollouts | None = None
 
     @model_validator(mode="after")
