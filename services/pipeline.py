@@ -16,6 +16,7 @@ from pup.policy.bundle import CARD, GRAPH, WEIGHTS, read_bundle
 from pup.recording import Recording, load_recordings
 from pup.recording_cuts import cut
 from pup.robot import RobotDescription
+from pup.sysid.problem import MODEL
 from services.diagnosis import CORRECTED
 from services.mission import STEPS, TRIALS, Means, Mission
 from services.presysid import identify
@@ -357,7 +358,9 @@ class _Job:
         return policy if card.method == "pup" else None
 
     def _measured(self, half: Half) -> dict[str, str]:
-        return _described(half) | {f"recording {r.id}": r.digest for r in self.recordings}
+        """What is replayed, and the number of the physics by which."""
+        recordings = {f"recording {r.id}": r.digest for r in self.recordings}
+        return _described(half) | recordings | {"physics": str(MODEL)}
 
     def _hash(self, *names: str) -> dict[str, str]:
         return {name: sha256(self.out / name) for name in names}

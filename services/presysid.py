@@ -17,15 +17,24 @@ from pup.diagnosis.nominal import FREE as FITTED_BY_DIAGNOSIS
 from pup.errors import InputError
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
-from pup.recording import Recording, originals
+from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
-from pup.sysid.bounds import Split, contact_splits, draw_subsets, expanded_range, widened
+from pup.sysid.bounds import (
+    WIDENING,
+    Split,
+    contact_splits,
+    draw_subsets,
+    expanded_range,
+    widened,
+)
 from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.imu import imu_names, with_imu
 from pup.sysid.problem import Problem
 from pup.sysid.report import write_report
-from pup.sysid.result import Bounds, SubsetFit, read_fitted
+from pup.sysid.result import Bounds, SubsetFit, fitted_to, read_fitted
 from pup.sysid.uncertainty import Spread, observable, spread_at
+from pup.sysid.wording import untold
+from services.presysid_folds import check_folds, held_out, kept_in_folds, pooled_rmse
 from services.presysid_options import Options
 from workers.fits import Fit, Runner, Status
 
@@ -77,12 +86,7 @@ class _Job:
         progress: Progress,
         threads: int,
     ) -> None:
-        apart = len(set(_originals(recordings)))
-        if options.folds == 1 or options.folds > apart:
-            raise InputError(
-                f"{options.folds} folds for {apart} recordings that repeat no other; use 2 to "
-                "their number, for each fold leaves some out and keeps some, or 0 for none"
-            )
+        check_folds(recordings, options.folds)
         options.check(recordings)
         self.robot, self.recordings, self.options = robot, recordings, options
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
@@ -91,6 +95,7 @@ class _Job:
         self.actuators = tuple(dict.fromkeys((options.actuator, *compared)))
         self.told = options.told()  # now: the file may change
         self.known = {} if options.start is None else self._begin(options.start)
+        self.known_by = None if options.start is None else fitted_to(options.start)
 
     def _begin(self, start: Path) -> dict[Actuator, ParameterSpace]:
         """The fitted values of another job, by its torque law."""
@@ -150,7 +155,13 @@ class _Job:
 
     def _problem(self, actuator: Actuator) -> Problem:
         """All recordings, with the parameters free that they can see."""
-        known = self.known.get(actuator)
+        problem = _seen(self._whole(actuator, self.known.get(actuator)))
+        if not problem.free:
+            raise InputError("nothing to fit: no parameter changes what the recordings measure")
+        return problem
+
+    def _whole(self, actuator: Actuator, known: ParameterSpace | None = None) -> Problem:
+        """All recordings, with every parameter free; at known values or at those described."""
         space = robot_space(self.robot, actuator) if known is None else known
         free = tuple(
             n for n in _movable(space) if not (self.options.fixed_network and n in NETWORK_NAMES)
@@ -158,28 +169,29 @@ class _Job:
         if self.options.imu:
             space, described = with_imu(space), robot_space(self.robot, actuator).names
             free += tuple(name for name in imu_names(space) if name not in described)
-        problem = _seen(Problem(self.robot, self.recordings, actuator, space, free, self.threads))
-        if not problem.free:
-            raise InputError("nothing to fit: no parameter changes what the recordings measure")
-        return problem
+        return Problem(self.robot, self.recordings, actuator, space, free, self.threads)
 
     def _nominal(self) -> tuple[dict[Actuator, FitResult], dict[str, float] | None]:
         """The nominal fit of each torque law, and the held-out error if there are folds."""
         full = self.full
         if self.options.as_described:
             return {actuator: self._kept(problem) for actuator, problem in full.items()}, None
-        folds = self._folds()
-        nominal = {a: self._fit_of_all(f"nominal_{a}", p) for a, p in full.items()}
+        folds = kept_in_folds(self.recordings, self.options.folds)
+        nominal = {
+            a: self._fit_of_all(f"nominal_{a}", p, near=a in self.known) for a, p in full.items()
+        }
         left_out = {
-            (a, k): self._fit_of_all(f"fold{k}of{len(folds)}_{a}", _seen(p.of(chosen)))
+            (a, k): self._fit_of_fold(f"fold{k}of{len(folds)}_{a}", p, kept)
             for a, p in full.items()
-            for k, chosen in enumerate(folds)
+            for k, kept in enumerate(folds)
         }
         results = self._fit("nominal fits", [*nominal.values(), *left_out.values()])
         fitted = dict(zip(nominal, results[: len(nominal)], strict=True))
         told = zip(left_out.items(), results[len(nominal) :], strict=True)
-        held_out = {key: (fit.problem, result) for (key, fit), result in told}
-        return fitted, self._held_out(held_out) if folds else None
+        if not folds:
+            return fitted, None
+        unseen = {key: (fit.problem, result) for (key, fit), result in told}
+        return fitted, held_out(self.recordings, folds, unseen, self.options.actuator)
 
     def _kept(self, problem: Problem) -> FitResult:
         """The values that a diagnosis has fitted as they are, and a fit of the others."""
@@ -190,28 +202,29 @@ class _Job:
         start = _described_at(part)
         o = self.options
         settings = FitSettings(start, NEAR_SIGMA, o.population, o.generations, o.seed)
-        (found,) = self._fit("what was not diagnosed", [Fit("others", part, settings)])
+        # Kept values are part of what is fitted beside: once these are others, it is another fit.
+        fit, place = Fit("others", part, settings), f"others-{_short(part.digest)}"
+        (found,) = self._fit("what was not diagnosed", [fit], place)
         best = _described_at(problem)
         best[[problem.free.index(name) for name in others]] = found.best
         return replace(found, best=best)
 
-    def _fit_of_all(self, name: str, problem: Problem) -> Fit:
+    def _fit_of_all(self, name: str, problem: Problem, near: bool) -> Fit:
+        """A fit from the nominal values, which are fitted ones or far from these."""
         o = self.options
-        start = _described_at(problem)
-        sigma = NEAR_SIGMA if problem.actuator in self.known else FAR_SIGMA
+        start, sigma = _described_at(problem), NEAR_SIGMA if near else FAR_SIGMA
         return Fit(name, problem, FitSettings(start, sigma, o.population, o.generations, o.seed))
 
-    def _folds(self) -> list[tuple[int, ...]]:
-        """Recordings kept in each fold.
+    def _fit_of_fold(self, name: str, problem: Problem, kept: Sequence[int]) -> Fit:
+        """A fit of some recordings, from values that were fitted to none of the others.
 
-        Whole motion types are left out where there are enough of them; else recordings, spread
-        over the types, a repeat always together with what it repeats.
+        What it cannot see stays where it begins, and a short search ends near there.
         """
-        folds = self.options.folds
-        motions = [(r.motion,) for r in self.recordings]
-        unit = motions if len(set(motions)) >= folds else _originals(self.recordings)
-        rank = {u: at for at, u in enumerate(sorted(set(unit)))}
-        return [tuple(i for i, u in enumerate(unit) if rank[u] % folds != k) for k in range(folds)]
+        left = {r.digest for i, r in enumerate(self.recordings) if i not in kept}
+        near = problem.actuator in self.known
+        if near and (self.known_by is None or not left.isdisjoint(self.known_by)):
+            problem, near = self._whole(problem.actuator), False
+        return self._fit_of_all(name, _seen(problem.of(kept)), near)
 
     def _subsets(self, bounded: Problem) -> tuple[SubsetFit, ...]:
         """Algorithm 1's fits, each over the bounded parameters that its recordings can see."""
@@ -254,9 +267,11 @@ class _Job:
         spread = self._spread(bounded)
         known, together = spread.confidence(0.9), spread.together(0.95)
         lower, upper = expanded_range(np.vstack([values, space.nominal]), space)
+        few = (~np.isnan(values)).sum(axis=0) < 2  # no range: the interval alone tells of these
         # An interval is of a minimum, which kept values are not: it does not widen their range.
-        if not self.options.as_described:
-            lower, upper = widened(lower, upper, (together.lower, together.upper), space)
+        most = 0.0 if self.options.as_described else WIDENING
+        interval, share = (together.lower, together.upper), np.where(few, 1.0, most)
+        lower, upper = widened(lower, upper, interval, space, share)
         lower = np.where(spread.unseen, space.lower, lower)
         upper = np.where(spread.unseen, space.upper, upper)
         actuator = self.options.actuator
@@ -273,13 +288,13 @@ class _Job:
             identified=known.identified,
             correlation=known.correlation,
             weights=bounded.space.select(phi).nominal,
-            imu=bounded.space.select(self._imu()),
+            imu=bounded.space.select(self._imu_told(bounded.space)),
             train=_measured(main, nominal),
             held_out=held_out,
             subsets=subsets,
             splits=self._splits(values, space, subsets),
             histories={a: fitted[a].history for a in self.full},
-            omitted=tuple(main.loss.omitted()),
+            omitted=(*main.loss.omitted(), *untold(space, few & ~spread.unseen, self.kept)),
             provenance=self._provenance(time.time() - begin),
         )
 
@@ -295,6 +310,13 @@ class _Job:
         seen = self.full[self.options.actuator]
         return tuple(name for name in seen.free if name in imu_names(seen.space))
 
+    def _imu_told(self, space: ParameterSpace) -> tuple[str, ...]:
+        """What is told of the IMU: what was fitted here, or acts as a start has it."""
+        names, fitted = robot_space(self.robot, self.options.actuator).names, self._imu()
+        acting = {name for name, v in zip(space.names, space.nominal, strict=True) if v != 0}
+        known = acting.difference(names).union(fitted)
+        return tuple(name for name in imu_names(space) if name in known)
+
     def _uncertainty(self, share: float) -> None:
         self.progress("uncertainty", [Status("replays", round(100 * share), 100, np.inf)])
 
@@ -306,24 +328,6 @@ class _Job:
         members = [[index[i] for i in s.recordings] for s in subsets]
         ground = [r.support == "ground" for r in self.recordings]
         return tuple(contact_splits(values, space, members, ground, self.options.seed))
-
-    def _held_out(
-        self, folds: dict[tuple[Actuator, int], tuple[Problem, FitResult]]
-    ) -> dict[str, float]:
-        """Pooled loss and root mean square error of the recordings that each fold left out."""
-        measures: dict[str, float] = {}
-        for actuator in self.actuators:
-            errors, losses = [], []
-            for k, kept in enumerate(self._folds()):
-                problem, result = folds[actuator, k]
-                left = tuple(r for i, r in enumerate(self.recordings) if i not in kept)
-                problem, best = replace(problem, recordings=left), result.best[None]
-                errors.append(problem.loss.rmse(problem.replay(best))[0])
-                losses.append(problem.losses(best)[0])
-            suffix = "" if actuator == self.options.actuator else f"_{actuator}"
-            measures["loss" + suffix] = float(np.mean(losses))
-            measures["rmse" + suffix] = _pooled(np.concatenate(errors))
-        return measures | {"folds": self.options.folds}
 
     def _provenance(self, seconds: float) -> dict[str, Any]:
         packages = ("pup", "mujoco", "nevergrad", "numpy")
@@ -339,11 +343,6 @@ class _Job:
 def _movable(space: ParameterSpace) -> list[str]:
     """The parameters of the nominal model; the description's terms stay as they are."""
     return [name for name in space.names if split_column(name) is None]
-
-
-def _originals(recordings: Sequence[Recording]) -> list[tuple[str, ...]]:
-    """Of each recording, what it is or repeats."""
-    return list(zip([r.motion for r in recordings], originals(recordings), strict=True))
 
 
 def _described_at(problem: Problem) -> Array:
@@ -385,15 +384,10 @@ def _measured(problem: Problem, fit: FitResult) -> dict[str, float]:
     before = _described_at(problem)
     replayed = problem.replay(np.stack([before, fit.best]))
     losses = problem.loss.total(problem.loss.terms(replayed))
-    errors = [_pooled(e) for e in problem.loss.rmse(replayed)]
+    errors = [pooled_rmse(e) for e in problem.loss.rmse(replayed)]
     return {
         "loss": float(losses[1]),
         "rmse": errors[1],
         "loss_before": float(losses[0]),
         "rmse_before": errors[0],
     }
-
-
-def _pooled(errors: Array) -> float:
-    """Root mean square over recordings and joints of per-joint errors, each with equal weight."""
-    return float(np.sqrt(np.nanmean(errors**2)))

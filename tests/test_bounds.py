@@ -44,6 +44,15 @@ def test_subsets(count: int, subsets: int, fraction: float, seed: int) -> None:
     assert draw_subsets(count, subsets + 3, fraction, seed)[:subsets] == drawn
 
 
+@given(st.integers(1, 80), st.integers(1, 12), st.floats(0, 1), st.integers(0, 2**31))
+def test_each_recording_comes_up_before_any_comes_up_twice(
+    count: int, subsets: int, fraction: float, seed: int
+) -> None:
+    drawn = draw_subsets(count, subsets, fraction, seed)
+    times = np.bincount([i for subset in drawn for i in subset], minlength=count)
+    assert times.max() - times.min() <= 1
+
+
 def test_subsets_are_drawn_evenly() -> None:
     drawn = np.concatenate([draw_subsets(10, 4000, 0.3, 0)])
     assert np.bincount(drawn.ravel(), minlength=10) == pytest.approx(1200, rel=0.1)
@@ -174,3 +183,5 @@ def test_an_interval_widens_a_range_but_not_without_end() -> None:
     interval = np.array([0.8, -8.0, 1.2]), np.array([1.5, 9.0, 1.4])
     found = widened(low, high, interval, space)
     np.testing.assert_allclose(found, [[0.8, 0.5, 1.0], [2.0, 2.5, 2.0]])
+    found = widened(low, high, interval, space, np.array([0.0, 1.0, 1.0]))
+    np.testing.assert_allclose(found, [[1.0, -8.0, 1.0], [2.0, 9.0, 2.0]])

@@ -1,6 +1,7 @@
 """Pre-sysID's fits: which are made, of what, and what is asked of each."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,14 +11,18 @@ from biped import biped
 from recordings import make
 
 from pup.errors import InputError
+from pup.files import read_json, write_json
+from pup.physics.parameters import robot_space
 from pup.recording import Recording
-from pup.robot import RobotDescription
+from pup.robot import RobotDescription, TermSpec
+from pup.robot_writer import write_corrected
 from pup.sysid.fit import FitResult
-from pup.sysid.result import Bounds
+from pup.sysid.result import Bounds, fitted_to, read_fitted
 from services import presysid
-from services.presysid import _Job
+from services.presysid import FAR_SIGMA, NEAR_SIGMA, _Job, identify
+from services.presysid_folds import kept_in_folds
 from services.presysid_options import Options
-from workers.fits import Fit, Progress
+from workers.fits import Fit, LocalRunner, Progress
 
 TICKS = 10
 
@@ -84,8 +89,7 @@ def test_repeats_are_no_units_of_folds(robot: RobotDescription, tmp_path: Path) 
         for name in "ab"
         for n in (1, 2)
     )
-    job, _ = job_of(robot, every, tmp_path, Options("pd", folds=2))
-    assert job._folds() == [(2, 3), (0, 1)]
+    assert kept_in_folds(every, 2) == [(2, 3), (0, 1)]
     with pytest.raises(InputError, match="3 folds for 2 recordings that repeat no other"):
         job_of(robot, every, tmp_path, Options("pd", folds=3))
 
@@ -177,6 +181,29 @@ class Moved(Idle):
         return [FitResult(np.clip(f.best + 0.1, 0, 1), f.loss, f.history) for f in found]
 
 
+@pytest.mark.parametrize(("subsets", "seen"), [(1, 0), (10, 1), (19, 2)])
+def test_the_only_recording_on_the_floor_tells_of_it(
+    robot: RobotDescription,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    subsets: int,
+    seen: int,
+) -> None:
+    """Ten subsets of two deal all of 19; of what too few see the whole interval is told."""
+    monkeypatch.setattr(presysid, "write_report", lambda *_: None)
+    alone = 3  # drawn anew each time, ten subsets of seed 0 miss it
+    supports = ["ground" if i == alone else "suspended" for i in range(19)]
+    every = tuple(stepped(f"r{i:02}", support) for i, support in enumerate(supports))
+    options = Options("pd", generations=1, subsets=subsets, fraction=0.1, compare=False)
+    bounds = job_of(robot, every, tmp_path, options)[0].run()
+    at = bounds.space.names.index("ground_friction")
+    values = [subset.values[at] for subset in bounds.subsets]
+    assert (~np.isnan(values)).sum() == seen
+    low, high = bounds.ci90[at]
+    assert seen == 2 or bounds.lower[at] <= low < high <= bounds.upper[at]
+    assert any("ground_friction" in line for line in bounds.omitted) == (seen < 2)
+
+
 def test_only_what_was_fitted_moves(robot: RobotDescription, tmp_path: Path) -> None:
     recordings = (stepped("a", "suspended"), stepped("b", "ground"))
     options = Options(generations=3, actuator="pd").corrected(("step",))
@@ -188,3 +215,96 @@ def test_only_what_was_fitted_moves(robot: RobotDescription, tmp_path: Path) -> 
     assert "ground_friction" in moved
     assert not [name for name in moved if name.startswith(("kp", "kd", "tau_max", "armature"))]
     assert len(moved) < len(problem.free)
+
+
+def written(folder: Path, robot: RobotDescription, **terms: float) -> RobotDescription:
+    """The robot, with friction of its left hip in its description."""
+    friction = TermSpec("coulomb_friction", "joint", "l_hip", terms)
+    return write_corrected(robot, folder, {}, (friction,))
+
+
+@pytest.mark.usefixtures("short_polish")
+def test_another_diagnosis_is_identified_in_the_same_folder(
+    robot: RobotDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Values that are kept are part of what is fitted beside them: that is another fit then."""
+    monkeypatch.setattr(presysid, "write_report", lambda *_: None)
+    recordings = (stepped("a", "suspended"), stepped("b", "ground"))
+    options = Options(generations=1, population=4, subsets=2, subset_generations=1)
+    options = replace(options.corrected(("step",)), imu=False)
+    told = []
+    for torque in (0.05, 0.1, 0.05):
+        corrected = written(tmp_path / f"robot{torque}", robot, torque=torque)
+        given = recordings, options, tmp_path / "out", LocalRunner(), lambda *_: None, 1
+        told.append(identify(corrected, *given))
+    assert told[0].train != told[1].train and told[0].train == told[2].train
+    assert len(list((tmp_path / "out/checkpoints").glob("others-*"))) == 2
+
+
+def start(
+    robot: RobotDescription, folder: Path, recordings: Sequence[Recording], **changes: float
+) -> Path:
+    """Bounds with other values than the description's, of a fit to recordings."""
+    space = robot_space(robot, "pd").at(changes)
+    document = {
+        "schema": 1,
+        "robot": robot.name,
+        "actuator": {"kind": "pd", "weights": []},
+        "parameters": [
+            {"name": name, "nominal": float(value)}
+            for name, value in zip(space.names, space.nominal, strict=True)
+        ],
+        "provenance": {"recordings": {r.id: r.digest for r in recordings}},
+    }
+    write_json(folder / "start.json", document)
+    return folder / "start.json"
+
+
+def test_folds_begin_at_nothing_that_was_fitted_to_what_they_leave_out(
+    robot: RobotDescription, tmp_path: Path
+) -> None:
+    """What the recordings of a fold cannot see would stay what the others have told."""
+    recordings = (stepped("air", "suspended"), stepped("floor", "ground"))
+    others = (stepped("other", "suspended"), stepped("other_floor", "ground"))
+    described = 0.7
+    for fitted, begun in ((recordings, described), (recordings[1:], described), (others, 0.9)):
+        file = start(robot, tmp_path, fitted, ground_friction=0.9)
+        options = Options("pd", folds=2, compare=False, start=file)
+        job, runner = job_of(robot, recordings, tmp_path / "out", options)
+        job._nominal()
+        folds = {fit.problem.recordings: fit for n, fit in runner.fits.items() if "fold" in n}
+        fit = folds[recordings[:1]]
+        assert "ground_friction" not in fit.problem.free
+        assert fit.problem.space.nominal[fit.problem.space.names.index("ground_friction")] == begun
+        assert fit.settings.sigma == (FAR_SIGMA if begun == described else NEAR_SIGMA)
+        whole = runner.fits["nominal_pd"].problem.space
+        assert whole.nominal[whole.names.index("ground_friction")] == 0.9
+
+
+def test_a_start_that_tells_no_recordings_may_have_seen_them_all(
+    robot: RobotDescription, tmp_path: Path
+) -> None:
+    file = start(robot, tmp_path, ())
+    assert fitted_to(file) == frozenset()
+    for provenance in ({}, [], {"recordings": []}):
+        write_json(file, {"provenance": provenance})
+        assert fitted_to(file) is None
+
+
+def test_an_imu_that_a_start_has_is_told_on(
+    robot: RobotDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It acts in the fit, and in whatever reads its bounds."""
+    monkeypatch.setattr(presysid, "write_report", lambda *_: None)
+    tilt = {"imu/roll": np.zeros(TICKS), "imu/pitch": np.linspace(0, 0.1, TICKS)}
+    recordings = (stepped("a", "suspended"), stepped("b", "ground", extras=tilt))
+    file = start(robot, tmp_path, ())
+    told = {"name": "imu_misalignment/pitch@sensor", "nominal": 0.05}
+    write_json(file, read_json(file) | {"imu": [told]})
+    options = Options("pd", subsets=2, compare=False, start=file)
+    job, _ = job_of(robot, recordings, tmp_path / "out", options)
+    bounds = job.run()
+    assert dict(zip(bounds.imu.names, bounds.imu.nominal, strict=True)) == {told["name"]: 0.05}
+    space = read_fitted(tmp_path / "out" / "bounds.json", robot)[1]
+    read = replace(job.full["pd"], space=space, free=())
+    assert read.losses(np.empty((1, 0)))[0] == pytest.approx(bounds.train["loss"], rel=1e-12)

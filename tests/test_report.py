@@ -15,6 +15,7 @@ from pup.sysid.html import tag
 from pup.sysid.loss import ReplayLoss
 from pup.sysid.overlays import write_overlays
 from pup.sysid.result import SubsetFit
+from services.tables import bounds_table
 from tests.reports import BOUNDS, DARWIN, RECORDINGS, Page, make_recording, make_replay, report
 
 
@@ -97,6 +98,32 @@ def test_unidentified_parameters_are_grey_and_say_so(page: Page) -> None:
         assert row[6].startswith("yes" if known else "not identified by these recordings")
     assert table[1][6] == "yes; at the range's end"
     assert "unknown" in page.source.split("</style>")[0]
+
+
+def test_the_end_of_a_range_is_told_to_programs_and_in_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document = BOUNDS.document()
+    at_end = [p["name"] for p in document["parameters"] if p["at_end"]]
+    assert at_end == [BOUNDS.space.names[0]]
+    monkeypatch.setenv("COLUMNS", "160")
+    loss = {"train": {"loss": 1, "rmse": 1, "loss_before": 2, "rmse_before": 2}, "held_out": None}
+    told = document | {"loss": loss, "provenance": {"options": {}, "seconds": 1}}
+    bounds_table(told, "rad")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines if "at an end of its range" in line] == at_end
+
+
+def test_a_parameter_that_too_few_subsets_see_is_named() -> None:
+    few = np.isin(np.arange(len(BOUNDS.space)), (0, 2))
+    a, b = BOUNDS.space.names[0], BOUNDS.space.names[2]
+    assert wording.untold(BOUNDS.space, few & False, ()) == []
+    (both,) = wording.untold(BOUNDS.space, few, ())
+    assert both.startswith(
+        f"fewer than two subsets see {a} and {b}: bounds hold the whole interval"
+    )
+    seen, kept = wording.untold(BOUNDS.space, few, {b})
+    assert f"see {a}: bounds" in seen and f"see {b}: kept as described" in kept
 
 
 def test_recordings_and_their_errors(page: Page) -> None:

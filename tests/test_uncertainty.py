@@ -1,15 +1,20 @@
 """What the minimum of a sum of norms tells of its parameters, against many draws of the noise."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from biped import biped
 from numpy.typing import NDArray
+from recordings import make
 from scipy.optimize import minimize
 
-from pup.physics.parameters import ParameterSpace
+from pup.physics.parameters import ParameterSpace, robot_space
 from pup.sysid import ripples
+from pup.sysid.problem import Problem
 from pup.sysid.ripples import LOOKS, SCALES, Shares, Surface, surface
 from pup.sysid.slopes import Slopes, Told, slopes
-from pup.sysid.uncertainty import over_ripples
+from pup.sysid.uncertainty import _shares, by_motion, over_ripples
 
 Array = NDArray[np.float64]
 TICKS = (slice(0, 60), slice(60, 100))
@@ -67,14 +72,24 @@ SCATTER = 0.02
 NOTHING = Slopes(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)))
 
 
-def rippled(rng: np.random.Generator, recordings: int = 10) -> tuple[Shares, Array]:
+AGAIN = 0.1
+"""Share of that scatter by which a motion's minimum moves when it is done again."""
+
+
+def rippled(
+    rng: np.random.Generator, recordings: int = 10, repeats: int = 1
+) -> tuple[Shares, Array]:
     """Losses of recordings, and the best of 300 points, where a fit would end.
 
-    Each recording has its own minimum, scattered about the middle, and ripples of a hundredth.
+    Each motion has its own minimum, scattered about the middle, and each recording of it ripples of
+    a hundredth. Recordings of one motion stand side by side.
     """
-    minima = 0.5 + SCATTER * rng.normal(size=(recordings, 3))
-    wave = rng.normal(size=(recordings, 2)) * 400
-    phase = rng.uniform(0, 2 * np.pi, recordings)
+    count = recordings * repeats
+    minima = 0.5 + SCATTER * rng.normal(size=(recordings, 3)).repeat(repeats, axis=0)
+    if repeats > 1:
+        minima += AGAIN * SCATTER * rng.normal(size=(count, 3))
+    wave = rng.normal(size=(count, 2)) * 400
+    phase = rng.uniform(0, 2 * np.pi, count)
 
     def shares(units: Array) -> Array:
         off = units[:, None] - minima
@@ -85,13 +100,18 @@ def rippled(rng: np.random.Generator, recordings: int = 10) -> tuple[Shares, Arr
     return shares, tried[np.argmin(shares(tried).mean(axis=1))]
 
 
-def intervals(recordings: int, draws: int, noise: Array) -> tuple[Array, Array]:
+def intervals(recordings: int, draws: int, noise: Array, repeats: int = 1) -> tuple[Array, Array]:
     """How often 90 % intervals hold the truth, and their median width, for three parameters."""
+    motions = [str(i) for i in range(recordings) for _ in range(repeats)]
     rng = np.random.default_rng(2)
     space = ParameterSpace(("a", "b", "c"), ("1",) * 3, np.full(3, 0.5), np.zeros(3), np.ones(3))
     inside, wide = [], []
     for _ in range(draws):
-        shares, unit = rippled(rng, recordings)
+        told_by, unit = rippled(rng, recordings, repeats)
+
+        def shares(units: Array, told_by: Shares = told_by) -> Array:
+            return by_motion(told_by(units), motions)
+
         start = np.diag([1e-6, 1e-6, 1 / 12])  # a ripple's slopes claim a thousandth
         ground = surface(shares, unit, start, NOTHING.curvature, 0.03)
         told = over_ripples(space, unit, NOTHING, ground, noise).confidence(0.9)
@@ -107,6 +127,38 @@ def test_ripples_hide_no_parameter_and_sharpen_none() -> None:
     assert (held[:2] < 0.99).all()
     assert (width[:2] < 0.08).all()
     assert width[2] > 0.85
+
+
+def test_motions_done_again_are_no_further_motions() -> None:
+    """Three motions of five recordings each know little more than three recordings do."""
+    held, width = intervals(3, 60, NOTHING.scatter, repeats=5)
+    assert (held[:2] > 0.8).all()
+    assert width[2] > 0.85
+
+
+def test_the_shares_of_motions_have_the_mean_of_the_recordings() -> None:
+    shares = np.array([[1.0, 2.0, 4.0, 8.0], [3.0, 0.0, 0.0, 1.0]])
+    told = by_motion(shares, ["b", "a", "b", "b"])
+    np.testing.assert_allclose(told, [[6.5, 1.0], [2.0, 0.0]])
+    np.testing.assert_allclose(told.mean(axis=1), shares.mean(axis=1))
+    assert np.array_equal(by_motion(shares, "abcd"), shares)
+
+
+def test_repeats_on_the_ground_are_counted_with_what_they_repeat(tmp_path: Path) -> None:
+    """What a motion adds is what its recordings add, and all of them add equation 1."""
+    robot = biped(tmp_path)
+    told = {"robot": "biped", "support": "ground", "motion": "stand", "joints": robot.joint_names}
+    told |= {"time": np.arange(8) / 30, "target": np.full((8, 2), 0.1)}
+    runs = tuple(
+        make(id=name, repeat_of=before, position=np.full((8, 2), 0.01 * at), **told)
+        for at, (name, before) in enumerate((("a", None), ("b", "a"), ("c", None)))
+    )
+    space = robot_space(robot, "pd")
+    problem = Problem(robot, runs, "pd", space, ("kp/hip", "ground_friction"))
+    units = np.array([[0.3, 0.5], [0.7, 0.2], [0.5, 0.9]])
+    shares = _shares(problem, np.full(3, True), lambda _: None)(units)
+    assert shares.shape == (3, 2)
+    np.testing.assert_allclose(shares.mean(axis=1), problem.losses(units), rtol=1e-12)
 
 
 def test_the_widest_scale_is_found_by_looking_at_few() -> None:

@@ -21,6 +21,11 @@ SPLIT_LEVEL = 0.05
 def draw_subsets(count: int, subsets: int, fraction: float, seed: int) -> list[tuple[int, ...]]:
     """Random subsets of recordings, drawn without replacement within each.
 
+    Algorithm 1 of the paper draws each subset anew, so that a tenth of the recordings may miss some
+    in all of its subsets, and with them the only ones that show a parameter. Here subsets are dealt
+    from the shuffled recordings, which are shuffled again when all are dealt: each comes up once
+    before any comes up twice, as far as the number of subsets goes.
+
     Args:
       count: number of recordings.
       subsets: how many subsets.
@@ -29,7 +34,15 @@ def draw_subsets(count: int, subsets: int, fraction: float, seed: int) -> list[t
     """
     rng = np.random.default_rng(seed)
     size = min(count, max(2, round(count * fraction)))
-    return [tuple(sorted(map(int, rng.permutation(count)[:size]))) for _ in range(subsets)]
+    drawn, deck = [], list[int]()
+    for _ in range(subsets):
+        subset, deck = deck[:size], deck[size:]
+        if short := size - len(subset):
+            fresh = list(map(int, rng.permutation(count)))
+            more = [i for i in fresh if i not in subset][:short]
+            subset, deck = subset + more, [i for i in fresh if i not in more]
+        drawn.append(tuple(sorted(subset)))
+    return drawn
 
 
 def expanded_range(fits: Array, space: ParameterSpace) -> tuple[Array, Array]:
@@ -49,7 +62,11 @@ def expanded_range(fits: Array, space: ParameterSpace) -> tuple[Array, Array]:
 
 
 def widened(
-    low: Array, high: Array, interval: tuple[Array, Array], space: ParameterSpace
+    low: Array,
+    high: Array,
+    interval: tuple[Array, Array],
+    space: ParameterSpace,
+    share: Array | float = WIDENING,
 ) -> tuple[Array, Array]:
     """A range that holds an interval, as far as that is little wider.
 
@@ -62,8 +79,10 @@ def widened(
       high: upper bounds.
       interval: its ends, likewise.
       space: of the parameters.
+      share: of their search ranges, by which each end moves at most; 1 where there is no range that
+        an interval could contradict.
     """
-    most = WIDENING * (space.upper - space.lower)
+    most = share * (space.upper - space.lower)
     return (
         np.minimum(low, np.maximum(interval[0], low - most)),
         np.maximum(high, np.minimum(interval[1], high + most)),

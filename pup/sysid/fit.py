@@ -191,8 +191,8 @@ class CmaFit:
             ) from error
         if identity != self.identity:
             raise InputError(
-                f"{path}: checkpoint of a fit with other recordings or settings; "
-                "use another --out or delete it"
+                f"{path}: checkpoint of a fit with other recordings or settings, or by the physics "
+                "of another pup; use another --out or delete it"
             )
         for generation in losses[: self.settings.generations]:
             self.ask()

@@ -41,6 +41,12 @@ class Terms:
     tilt: Array
     feet: Array
 
+    @staticmethod
+    def joined(parts: Sequence["Terms"]) -> "Terms":
+        """Those of some candidates after those of others."""
+        sums = zip(*((part.position, part.tilt, part.feet) for part in parts), strict=True)
+        return Terms(*map(np.concatenate, sums))
+
 
 class ReplayLoss:
     """Compares trajectories with the recordings they replay.

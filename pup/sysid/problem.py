@@ -14,12 +14,16 @@ from pup.physics.parameters import ParameterSpace
 from pup.physics.simulator import Trajectories
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
-from pup.sysid.loss import ReplayLoss
+from pup.sysid.loss import ReplayLoss, Terms
 
 Array = NDArray[np.float64]
 
-MODEL = 8
+MODEL = 9
 """Raised with every change of the physics or the loss, which makes old checkpoints another's."""
+MEMORY = 256 * 2**20
+"""Bytes that trajectories and what equation 1 makes of them may take at once, about."""
+COPIES = 3.5
+"""Arrays as large as the trajectories that equation 1 holds beside one another, with them."""
 _VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "numba", "nevergrad", "cma")))
 
 
@@ -86,9 +90,21 @@ class Problem:
         """Replay candidates (n, n_free) on the unit cube."""
         return self._simulator.replay(self.space.candidates(self.values(unit)))
 
+    def terms(self, unit: Array) -> Terms:
+        """The sums of equation 1 of candidates (n, n_free), however many: some are in memory."""
+        pieces = np.array_split(unit, -(-len(unit) // self.at_once))
+        return Terms.joined([self.loss.terms(self.replay(piece)) for piece in pieces])
+
+    @cached_property
+    def at_once(self) -> int:
+        """Candidates whose trajectories fit in MEMORY."""
+        numbers = len(self.robot.joints) + 2 + 3 * len(self.robot.feet)  # per tick
+        candidate = COPIES * 8 * numbers * self.loss.ticks[-1].stop
+        return max(1, int(MEMORY / candidate))
+
     def losses(self, unit: Array) -> Array:
         """Equation 1 of candidates (n, n_free), shape (n,)."""
-        return self.loss.total(self.loss.terms(self.replay(unit)))
+        return self.loss.total(self.terms(unit))
 
     def errors(self, unit: Array) -> tuple[Array, NDArray[np.int64]]:
         """Weighted errors of candidates (n, n_free) and their blocks, see ReplayLoss."""

@@ -151,7 +151,7 @@ class _Report:
                 ("yes" if bounds.identified[i] else _NOT)
                 + ("; at the range's end" if edge else ""),
             )
-            for i, edge in enumerate(wording.at_edge(bounds))
+            for i, edge in enumerate(bounds.at_end)
         ]
         yield table(
             f"Bounded parameters (grey: {_NOT}; unit 1: plain number)",
@@ -164,13 +164,14 @@ class _Report:
             "Nominal: the fit to all recordings, or the values that were kept. Lower and "
             "upper: the range of this and of the fits to random subsets, 10 % wider at both ends, "
             "and widened towards an interval that holds all parameters at once in 95 % of cases, "
-            "by a twentieth of the search range at most; the whole search range where the "
-            "recordings tell next to nothing. 90 % interval: how far the nominal fit is "
+            "by a twentieth of the search range at most, or to all of it where fewer than two "
+            "subsets see the parameter; the whole search range where the recordings tell next to "
+            "nothing. 90 % interval: how far the nominal fit is "
             "determined if the model is right, with values that were kept taken as known.",
         )
         if len(bounds.imu):
             yield tag("p", "Fitted beside, of the IMU: ", wording.imu_words(bounds), ".")
-        if any(wording.at_edge(bounds)):
+        if bounds.at_end.any():
             yield tag(
                 "p",
                 "At the range's end: the fit stopped at an end of its search range, so the best "

@@ -17,6 +17,8 @@ from pup.sysid.imu import imu_names, with_imu
 
 Array = NDArray[np.float64]
 SCHEMA = 1
+AT_END = 0.01
+"""Share of a search range from an end of which on a value stands there: the best may lie beyond."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class Bounds:
       subsets: the subset fits.
       splits: parameters tested for a split between subsets with and without contact.
       histories: best equation 1 so far, per generation of each actuator's nominal fit.
-      omitted: what of equation 1 the recordings could not give, in words.
+      omitted: what of equation 1, and of the range of the subset fits, the recordings could not
+        give, in words.
       provenance: how it came about.
     """
 
@@ -82,6 +85,12 @@ class Bounds:
     histories: dict[str, Array]
     omitted: tuple[str, ...]
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def at_end(self) -> NDArray[np.bool_]:
+        """Whether each nominal value stands at an end of its search range, to 1 % of it."""
+        unit = self.space.normalise(self.nominal)
+        return np.asarray((unit < AT_END) | (unit > 1 - AT_END))
 
     def as_before(self, file: Path) -> "Bounds":
         """The same with the seconds that a file tells, where it tells the same but for these.
@@ -145,6 +154,7 @@ class Bounds:
             "search": [float(self.space.lower[i]), float(self.space.upper[i])],
             "ci90": [float(v) for v in self.ci90[i]],
             "identified": bool(self.identified[i]),
+            "at_end": bool(self.at_end[i]),
         }
 
 
@@ -211,6 +221,18 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
         if strange := [name for name in imu if name not in imu_names(space)]:
             raise InputError(f"{path}: parameter {strange[0]!r} is not one of an IMU")
     return kind, space.at(values | imu)
+
+
+def fitted_to(path: Path) -> frozenset[str] | None:
+    """Digests of the recordings that a bounds file was fitted to; None where it does not tell.
+
+    Raises:
+      InputError: the file is not JSON.
+    """
+    try:
+        return frozenset(map(str, read_json(path)["provenance"]["recordings"].values()))
+    except (LookupError, TypeError, AttributeError):
+        return None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ An impact comes a tick earlier or later, a foot slips or does not: equation 1 ha
 ends in one of them. Slopes taken there are the ripple's, and claim ten times more than the
 recordings know. A surface through replays around the fit, so far away that equation 1 rises well
 above its ripples, looks over them: its curvature tells how sharp the minimum is, and the scatter of
-its slopes from recording to recording where it would be with others (sandwich, by recordings).
+its slopes from motion to motion where it would be with others (sandwich, by motions with their
+repeats).
 """
 
 from bisect import bisect_left
@@ -17,7 +18,7 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 Shares = Callable[[Array], Array]
-"""Candidates (n, k) on the unit cube to each recording's share, shape (n, n_recordings)."""
+"""Candidates (n, k) on the unit cube to each motion's share, shape (n, n_motions)."""
 
 ROUNDS = (3, 6)
 """Replays per coefficient of the surface: of a rough one that tells in which directions to look how
@@ -34,7 +35,7 @@ WIDEST = 0.15
 SIGNIFICANT = 3.0
 """Standard errors of a curvature from which it is one."""
 BATCH = 256
-"""Replays held in memory at once."""
+"""Replays asked for at once; how many are in memory is their maker's to say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,7 @@ class Surface:
     All on the unit cube of k parameters.
 
     Attributes:
-      slopes: of each recording's share, shape (n_recordings, k); their mean is equation 1's.
+      slopes: of each motion's share, shape (n_motions, k); their mean is equation 1's.
       slope_error: covariance of a slope by the ripples left in it, shape (k, k).
       curvature: as far as it is significant, shape (k, k).
       at_least: the same with its error where it is not, shape (k, k).
@@ -68,7 +69,7 @@ def surface(shares: Shares, unit: Array, covariance: Array, hanging: Array, rise
     """Fit the surface around a point.
 
     Args:
-      shares: what each recording on the ground adds to equation 1.
+      shares: what each motion on the ground, with its repeats, adds to equation 1.
       unit: the point on the unit cube, shape (k,).
       covariance: of the parameters by the local slopes, shape (k, k): where to begin.
       hanging: curvature that the other recordings give equation 1, shape (k, k).
@@ -93,7 +94,7 @@ class _Seen:
 
     Attributes:
       off: where they are, from that point, shape (n, k).
-      told: each recording's share, shape (n, n_recordings).
+      told: each motion's share, shape (n, n_motions).
     """
 
     off: Array

@@ -1,6 +1,6 @@
 """What the recordings say about each parameter around a fitted point."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pup.physics.parameters import ParameterSpace
+from pup.recording import originals
 from pup.sysid.gauss_newton import Confidence, confidence, step_within
 from pup.sysid.problem import Problem
 from pup.sysid.ripples import Shares, Surface, replays, surface
@@ -133,19 +134,38 @@ def spread_at(
 def _shares(
     problem: Problem, chosen: NDArray[np.bool_], progress: Callable[[float], None]
 ) -> Shares:
-    """What each of some recordings adds to equation 1 over all of them."""
+    """What each motion of some recordings, with repeats, adds to equation 1 over all of them."""
     part, done = problem.of(np.flatnonzero(chosen).tolist()), 0
-    whole = replays(len(problem.free))
+    whole, motions = replays(len(problem.free)), originals(part.recordings)
 
     def shares(units: Array) -> Array:
         nonlocal done
         progress(done / whole)
         done += len(units)
-        terms = part.loss.terms(part.replay(units))
+        terms = part.terms(units)
         # The mean of positions is over all recordings, those of tilt and feet over these anyway.
-        return np.asarray(part.loss.shares(terms) + (chosen.mean() - 1) * terms.position)
+        told = part.loss.shares(terms) + (chosen.mean() - 1) * terms.position
+        return by_motion(told, motions)
 
     return shares
+
+
+def by_motion(shares: Array, motions: Sequence[str]) -> Array:
+    """Shares of a loss by what was done, whose mean stays that of the recordings' shares.
+
+    A motion done again strays from the model as it did before: repeats say no more of how another
+    motion would have told than the first one does.
+
+    Args:
+      shares: of each recording, shape (n_candidates, n_recordings).
+      motions: what each recording is or repeats, `pup.recording.originals`.
+
+    Returns:
+      Shape (n_candidates, n_motions), in the order of their first recordings.
+    """
+    names = tuple(dict.fromkeys(motions))
+    member = np.array([[motion == name for name in names] for motion in motions])
+    return np.asarray(shares @ member * (len(names) / len(motions)))
 
 
 def over_ripples(
@@ -159,9 +179,9 @@ def over_ripples(
       hanging: of the recordings in the air.
       ground: of those with contact.
       noise: covariance of the slopes of those by their readings, shape (k, k). It stands in where
-        there is a single one, which cannot tell how another would differ.
+        there is a single motion, which cannot tell how another would differ.
     """
-    count = len(ground.slopes)
+    count = len(ground.slopes)  # of motions: repeats are none of their own
     mean = ground.slopes.mean(axis=0)
     off = (ground.slopes - mean) / np.sqrt(count * max(count - 1, 1))
     both = Slopes(
@@ -186,11 +206,11 @@ def over_ripples(
 def _freedom(squares: Array, variance: Array) -> Array:
     """Degrees of freedom of variances, after Welch and Satterthwaite.
 
-    Only the scatter over recordings is an estimate, and a normal variable's fourth moment is three
+    Only the scatter over motions is an estimate, and a normal variable's fourth moment is three
     times its variance's square.
 
     Args:
-      squares: what each recording adds to the variances, shape (n_recordings, k).
+      squares: what each motion adds to the variances, shape (n_motions, k).
       variance: with all that is known, shape (k,).
     """
     estimated = squares.sum(axis=0)

@@ -1,7 +1,7 @@
 """What the report of pre-sysID says in words."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -209,10 +209,20 @@ def imu_words(bounds: Bounds) -> str:
     )
 
 
-def at_edge(bounds: Bounds) -> list[bool]:
-    """Whether each nominal value stands at an end of its search range, to 1 % of it."""
-    unit = bounds.space.normalise(bounds.nominal)
-    return [bool(value < 0.01 or value > 0.99) for value in unit]
+def untold(space: ParameterSpace, few: NDArray[np.bool_], kept: Collection[str]) -> list[str]:
+    """Which parameters have no range of subset fits, and what their bounds are then.
+
+    Args:
+      space: the bounded parameters.
+      few: whether fewer than two subsets see each, shape (n_parameters,).
+      kept: those whose values were kept as described.
+    """
+    names = [name for name, so in zip(space.names, few, strict=True) if so]
+    seen = {
+        "bounds hold the whole interval by all recordings": [n for n in names if n not in kept],
+        "kept as described; bounds do not tell how far off": [n for n in names if n in kept],
+    }
+    return [f"fewer than two subsets see {listed(n)}: {so}" for so, n in seen.items() if n]
 
 
 def flattened(value: Any, name: str = "") -> list[tuple[str, str]]:
