@@ -1,6 +1,7 @@
 """Bounds of a fleet from the fits of its robots."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +155,25 @@ def test_an_effect_that_a_robot_has_not_is_one_of_size_zero(tmp_path: Path) -> N
     agents.bundle(tmp_path, parameters=names, lively=True)
     policy = NumpyPolicy.load(tmp_path, DARWIN)
     mu = np.append(fitted.space.select(fitted.names).nominal, 0.0)
-    assert np.array_equal(fitted_eta(policy, fitted), policy.project(policy.card.scale.unit(mu)))
+    known = np.clip(mu, policy.card.parameter_lower, policy.card.parameter_upper)
+    eta = policy.project(policy.card.scale.unit(known))
+    assert np.array_equal(fitted_eta(policy, fitted), eta)
     agents.bundle(tmp_path, parameters=("rho/knee", "rho/tail"))
     with pytest.raises(InputError, match="of a model with 'rho/tail', which the fitted has not"):
         fitted_eta(NumpyPolicy.load(tmp_path, DARWIN), fitted)
+
+
+def test_parameters_that_no_training_has_seen_are_taken_at_the_nearest_that_one_has(
+    tmp_path: Path,
+) -> None:
+    """A projection of what lies beyond the policy's bounds is a guess that robots fell by."""
+    fitted = read_bounds(DARWIN.identified_path, DARWIN)
+    agents.bundle(tmp_path, parameters=fitted.names, lively=True)
+    policy = NumpyPolicy.load(tmp_path, DARWIN)
+    card = policy.card
+    at_end = replace(fitted.space.select(fitted.names), nominal=np.array(card.parameter_upper))
+    beyond = replace(at_end, nominal=np.array(card.parameter_upper) + 1.0)
+    near, far = (fitted_eta(policy, replace(fitted, space=space)) for space in (at_end, beyond))
+    assert np.array_equal(far, near)
+    unclipped = policy.project(card.scale.unit(np.array(card.parameter_upper) + 1.0))
+    assert not np.array_equal(unclipped, near)

@@ -12,7 +12,9 @@ from pup.sysid.result import FittedBounds
 def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]:
     """The projection of the fitted parameters, shape (n_eta,).
 
-    An effect that the fitted model has not is one of size zero.
+    An effect that the fitted model has not is one of size zero. Parameters beyond the bounds that
+    the policy was trained within are taken at the nearest end: no training has seen what the
+    projection makes of others, and robots fell by it (docs/results/experiment.md).
 
     Raises:
       InputError: the policy knows parameters that the fitted model does not have.
@@ -23,4 +25,5 @@ def fitted_eta(policy: NumpyPolicy, bounds: FittedBounds) -> NDArray[np.float64]
     if unknown := [name for name in card.parameters if name not in told]:
         raise InputError(f"the policy is of a model with {unknown[0]!r}, which the fitted has not")
     mu = np.array([told[name] for name in card.parameters])
-    return policy.project(card.scale.unit(mu))
+    known = np.clip(mu, card.parameter_lower, card.parameter_upper)
+    return policy.project(card.scale.unit(known))
