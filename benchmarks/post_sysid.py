@@ -32,7 +32,7 @@ from pup.files import read_json, sha256, write_json
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import read_bounds
-from services.laboratory import RATE, Laboratory
+from services.laboratory import Laboratory, period_of
 from services.transfer import read_simulated
 from services.trials import Budget, fitted_eta, follow
 
@@ -113,10 +113,10 @@ class Grid:
 
     def walked(self, eta: Array, draw: int) -> Array:
         """Distances of some etas, m, shape (n,)."""
-        told = []
+        told, period = [], period_of(self.robot)
         for part in np.split(eta, range(ABREAST, len(eta), ABREAST)):
             fleet = Fleet(self.robot, [self.seed] * len(part))
-            told.append(walk(fleet, self.policy, part, self.horizon, 1 / RATE, draw).distance)
+            told.append(walk(fleet, self.policy, part, self.horizon, period, draw).distance)
         return np.concatenate(told)
 
     def best(self, side: int, record: Path) -> float:

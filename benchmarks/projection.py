@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.walks import Trial, drawn, figures, whose_walks
 from pup.policy.bundle import NumpyPolicy
-from services.experiment.statistics import Estimate, estimate, mean
+from services.experiment.statistics import Estimate, mean
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def exchanged(mu: Array, columns: NDArray[np.bool_], rng: np.random.Generator) -
 
 def average(differences: Array) -> Estimate:
     """The mean of a difference over robots, with its 90 % interval."""
-    return estimate(mean, differences[:, None].tolist())
+    return mean(differences.tolist())
 
 
 def analysed(trial: Trial, mu: Array, seed: int) -> dict[str, Any]:
