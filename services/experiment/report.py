@@ -123,7 +123,7 @@ def _other_bounds(told: Mapping[str, Any]) -> Iterator[Html]:
             "p",
             f"{', '.join(names)}: given, and trained on bounds ({bounds[:12]}) that are not this "
             f"fleet's; {share} of the parameters that were fitted to its robots lie outside of "
-            f"these{f' ({by_name})' if by_name else ''}, where PUP's eta is extrapolated.",
+            f"these{f' ({by_name})' if by_name else ''}; the fitted eta is of the nearest within.",
         )
 
 
