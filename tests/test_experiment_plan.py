@@ -122,6 +122,7 @@ def test_cells_stand_behind_what_they_need_and_are_no_more_than_wanted(plan: Pla
                 assert i < walk.robots or name not in cells
     own = [name for name in cells if name.endswith("-own")]
     assert bool(own) <= plan.control
+    assert plan.control or not any(name.endswith("-undiagnosed") for name in cells)
     for name in list(cells)[:3]:
         part = chosen(cells, [name])
         assert list(part)[-1] == name and list(part) == [n for n in cells if n in part]
@@ -134,11 +135,11 @@ def test_the_default_plan_is_that_of_the_issue() -> None:
     for direction, methods, robots in (("forward", 4, 10), ("backward", 2, 4), ("sideways", 2, 4)):
         arms = {n.split("-", 3)[3] for n in walked if f"-{direction}-" in n}
         searched = methods - 2 if methods == 4 else methods - 1
-        # All again where the fleet is diagnosed, priors, the corrected and its control.
-        assert len(arms) == 2 * methods + searched + 2
+        # All again where the fleet is diagnosed, priors, the corrected, and both's controls.
+        assert len(arms) == 2 * methods + searched + 3
         assert sum(n.endswith(f"-{direction}-pup") for n in walked) == robots
     trained = [n for n in cells if n.startswith("policy-") and not n.startswith("policy-r1")]
-    assert len(trained) == 16
+    assert len(trained) == 19
     assert cells["presysid-fleet"].needs == {
         f"recordings {s}": f"record-r{s}" for s in Plan().seeds
     }
@@ -165,6 +166,12 @@ def test_a_diagnosed_fleet_is_what_its_corrected_robots_share() -> None:
     own = {"bounds": "presysid-r1001-corrected", "robot": "diagnosis-r1001"}
     assert walked.needs == {"policy": "policy-forward-pup-diagnosed"} | own
     assert not {n for n in cells if n.startswith("trials-") and not n.endswith("-diagnosed")}
+    # Its control knows of no diagnosis, and is trained on from the same policy for as long.
+    known = graph(replace(small(), stages=("undiagnosed",)))
+    policy = known["policy-forward-pup-undiagnosed"]
+    assert policy.needs == {"bounds": "presysid-fleet", "start": "policy-forward-pup"}
+    assert policy.told == cells["policy-forward-pup-diagnosed"].told
+    assert {cell.kind for cell in known.values()} == {"record", "presysid", "policy", "trials"}
     alone = graph(replace(small(), seeds=(1000,), stages=("diagnosed",)))
     assert not alone  # one robot shares nothing
 
@@ -174,7 +181,7 @@ def test_what_does_not_matter_to_a_cell_is_not_told_it() -> None:
     first = graph(small())
     trials = graph(replace(small(), trials=replace(small().trials, trials=4)))
     changed = {n for n in first if first[n].told != trials[n].told}
-    ends = ("-pup", "-up", "-own", "-corrected", "-pup-diagnosed", "-up-diagnosed")
+    ends = ("-pup", "-up", "-own", "-corrected", "-undiagnosed", "-pup-diagnosed", "-up-diagnosed")
     assert changed == {n for n in first if n.startswith("trials-") and n.endswith(ends)}
     longer = replace(small(), train=replace(small().train, fleet="--steps 2000"))
     changed = {n for n in first if first[n].told != graph(longer)[n].told}

@@ -260,9 +260,11 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert lines["forward, diagnosed fleet: PUP by Nominal"]["holds"]
     assert lines["error held out is lower by (median)"]["value"] == pytest.approx(0.55)
     assert all(line["planned"] == line["robots"] for line in lines.values())
-    # The control of each robot is trained on as long as what is corrected, not as for a fleet.
-    assert ratios["corrected / fleet"]["controlled"]
-    assert not ratios["diagnosed / fleet"]["controlled"] and "controlled" not in ratios["pup / up"]
+    # What is trained on with a diagnosis has a control that is trained on as long without.
+    assert ratios["corrected / fleet"]["controlled"] and ratios["diagnosed / fleet"]["controlled"]
+    assert "controlled" not in ratios["pup / up"]
+    added = ratios["diagnosed / undiagnosed, no trials"]
+    assert added["value"] == pytest.approx(experiments.FURTHER, rel=0.15) and added["robots"] == 10
     assert not [name for name in lines if "sideways: PUP by Nominal" in name]
     named = document["diagnosis"]["robots"]
     share = np.mean(["ground_compliance" in one["classes"] for one in named.values()])
@@ -272,7 +274,7 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert not {"b", "script", "link"} & {name for name, _ in page.elements}
     assert "needs <b>presysid</b>" in page.text and "stopped by overload: <b>" in page.text
     images = [attributes["src"] for name, attributes in page.elements if name == "img"]
-    assert len(images) == 24 and all(i.startswith("data:image/svg+xml") for i in images)
+    assert len(images) == 27 and all(i.startswith("data:image/svg+xml") for i in images)
     assert estimated(ratios["pup / robust"]) in page.text
 
 

@@ -18,7 +18,7 @@ from services.experiment.plan import Plan
 from services.experiment.report import write_report
 from services.experiment.verdicts import acceptance, of_direction
 
-BUDGETS = {"own": 8, "corrected": 8, "diagnosed": 15}
+BUDGETS = {"own": 8, "corrected": 8, "diagnosed": 15, "undiagnosed": 15}
 NOBODY = diagnoses(Plan(seeds=(1,)), {}, {})
 
 
@@ -138,10 +138,11 @@ def test_what_was_trained_longer_is_said_to_be_so_but_for_a_control_of_the_same_
     assert f"{name}{words}" in lines(walks(**arms))
     assert f"{name}{words}" in lines(walks(**arms, pup_own_fitted=[1.1, 1.1, None]))
     assert name in lines(walks(**arms, pup_own_fitted=[1.1] * 3))
-    # The control of what was trained on for one robot is shorter than that of a fleet.
+    # The control of what was trained on for one robot is none of a fleet's.
     fleet = {"pup_fitted": [1.0] * 3, "pup_diagnosed_fitted": [1.5] * 3}
     name = "forward: no trials, diagnosed fleet by the fleet"
     assert f"{name}{words}" in lines(walks(**fleet, pup_own_fitted=[1.1] * 3))
+    assert name in lines(walks(**fleet, pup_undiagnosed_fitted=[1.1] * 3))
 
 
 class Done:

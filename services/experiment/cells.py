@@ -18,6 +18,8 @@ FLEET = "presysid-fleet"
 DIAGNOSED = "diagnosed"
 """Of a fleet that is simulated with what its diagnoses share: a stage, and how its cells end."""
 DIAGNOSED_FLEET = f"{FLEET}-{DIAGNOSED}"
+UNDIAGNOSED = "undiagnosed"
+"""Their control, a fleet that is simulated as it was: a stage, and how its cells end."""
 SEARCHED = (Method.PUP, Method.UP)
 """Methods whose policies are conditioned on something that trials can choose."""
 
@@ -92,6 +94,9 @@ class _Graph:
             if Method.PUP in walk.methods:
                 self._corrected(walk)
         self._diagnosed()
+        for walk in self.plan.walks:
+            if self.plan.control and Method.PUP in walk.methods:
+                self._undiagnosed(walk)
         if self.real is not None:
             self._real(self.real)
         done = (*self.plan.stages, "real")
@@ -141,8 +146,9 @@ class _Graph:
         """Which stage a cell belongs to."""
         if cell.name.endswith("-real"):
             return "real"
-        if cell.name.endswith(f"-{DIAGNOSED}"):
-            return DIAGNOSED
+        for stage in (DIAGNOSED, UNDIAGNOSED):
+            if cell.name.endswith(f"-{stage}"):
+                return stage
         if "corrected" in cell.name or cell.name.endswith("-own"):
             return "corrected"
         if cell.name.endswith("-prior") or cell.kind == "landscape":
@@ -292,6 +298,16 @@ class _Graph:
                 for seed in self._seeds(walk):
                     name = f"trials-r{seed}-{walk.direction}-{method}-{DIAGNOSED}"
                     self._tried(name, seed, method, policy, refits[seed])
+
+    def _undiagnosed(self, walk: Walk) -> None:
+        """The fleet's PUP policy trained on for as long on bounds that know of no diagnosis."""
+        method = Method.PUP
+        first = f"policy-{walk.direction}-{method}"
+        policy, words = f"{first}-{UNDIAGNOSED}", self.plan.train.diagnosed
+        self._trained(policy, walk, method, words, {"bounds": FLEET, "start": first})
+        for seed in self._seeds(walk):
+            name = f"trials-r{seed}-{walk.direction}-{method}-{UNDIAGNOSED}"
+            self._tried(name, seed, method, policy, {"bounds": f"presysid-r{seed}"})
 
     def _corrected(self, walk: Walk) -> None:
         """The fleet's policy trained on for each robot, in its corrected simulator and its own."""

@@ -42,6 +42,8 @@ NAMES = {
     "pup+corrected": "PUP trained on + BO, corrected",
     "pup+own+fitted": "PUP trained on, own simulator, no trials",
     "pup+corrected+fitted": "PUP trained on, corrected, no trials",
+    "pup+undiagnosed": "PUP trained on + BO, undiagnosed fleet",
+    "pup+undiagnosed+fitted": "PUP trained on, undiagnosed fleet, no trials",
     "pup+diagnosed": "PUP + BO, diagnosed fleet",
     "up+diagnosed": "UP + BO, diagnosed fleet",
     "robust+diagnosed": "Robust, diagnosed fleet",
@@ -51,7 +53,7 @@ NAMES = {
 }
 """What arms are called where people read."""
 METHODS = tuple(COLOURS)
-FURTHER = {"own": PURPLE, "corrected": GREEN}
+FURTHER = {"own": PURPLE, "corrected": GREEN, "undiagnosed": SOFT}
 """Colours of policies that were trained on."""
 DASHES = {"prior": "--", "diagnosed": ":"}
 MODELS = {

@@ -7,7 +7,7 @@ from typing import Any
 from pup.files import read_json, sha256
 from pup.policy.bundle import CARD
 from pup.policy.shape import Method
-from services.experiment.cells import DIAGNOSED, DIAGNOSED_FLEET, FLEET, Cell
+from services.experiment.cells import DIAGNOSED, DIAGNOSED_FLEET, FLEET, UNDIAGNOSED, Cell
 from services.experiment.diagnosed import diagnoses
 from services.experiment.plan import Plan, Walk, meant
 from services.experiment.run import Order, digest
@@ -73,7 +73,8 @@ def _cell(order: Order) -> dict[str, Any]:
 
 def _budgets(plan: Plan) -> dict[str, int]:
     """Steps of policies that are trained on, by the end of their arms."""
-    words = dict.fromkeys(FURTHER, plan.train.further) | {DIAGNOSED: plan.train.diagnosed}
+    words = dict.fromkeys(FURTHER, plan.train.further)
+    words |= dict.fromkeys((DIAGNOSED, UNDIAGNOSED), plan.train.diagnosed)
     return {end: int(meant(told, further=True)["steps"]) for end, told in words.items()}
 
 
@@ -116,7 +117,8 @@ def _direction(
     An arm is a method, whose eta was chosen by trials, with what is different: `+prior` where the
     search began with simulated rollouts, `+own` and `+corrected` where the policy was trained on in
     a simulator of this robot, `+diagnosed` in one of the fleet with what its diagnoses share,
-    `+fitted` where eta is that of the fitted parameters, without trials.
+    `+undiagnosed` in one without, `+fitted` where eta is that of the fitted parameters, without
+    trials.
     """
     walks: dict[str, Any] = {}
     searches: dict[str, Any] = {}
@@ -127,6 +129,7 @@ def _direction(
         named |= {f"{m}+prior": f"{start}{m}{PRIOR}" for m in walk.methods}
         named |= {f"{m}+{DIAGNOSED}": f"{start}{m}-{DIAGNOSED}" for m in walk.methods}
         named |= {f"{Method.PUP}+{way}": f"{start}{way}" for way in FURTHER}
+        named[f"{Method.PUP}+{UNDIAGNOSED}"] = f"{start}{Method.PUP}-{UNDIAGNOSED}"
         for arm, name in named.items():
             if name not in cells:
                 continue

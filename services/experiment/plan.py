@@ -20,6 +20,7 @@ LIMIT = 2**18  # bytes of a plan
 ALL = tuple(Method)
 STAGES = (
     *("record", "presysid", "policy", "trials", "prior", "diagnosis", "corrected", "diagnosed"),
+    "undiagnosed",
 )
 """What can be left out; what a stage needs is done in any case."""
 PARTS = ("record", "presysid", "fleet", "train", "trials", "diagnosis")

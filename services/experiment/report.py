@@ -294,6 +294,7 @@ def _without_trials(direction: str, walks: Mapping[str, Any]) -> Iterator[Html]:
     before = walks.get("pup+fitted", {})
     for way, where in (
         ("corrected", "the corrected simulator of this robot"),
+        ("undiagnosed", "the fleet's own simulator, for as long as with the diagnoses"),
         ("diagnosed", "a simulator of the fleet with what its diagnoses share"),
     ):
         after = walks.get(f"pup+{way}+fitted", {})

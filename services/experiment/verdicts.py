@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from services.experiment.cells import DIAGNOSED
+from services.experiment.cells import DIAGNOSED, UNDIAGNOSED
 from services.experiment.statistics import (
     FEW,
     best_so_far,
@@ -23,7 +23,9 @@ RIVALS = ("robust", "nominal", "up")
 FITTED = "+fitted"
 """How arms end whose eta is that of the fitted parameters."""
 OWN = "own"
-"""How the arm ends that is the control of those that were trained on with a diagnosis."""
+"""How the arm ends that is the control of those trained on in their corrected simulators."""
+CONTROLS = {"corrected": OWN, DIAGNOSED: UNDIAGNOSED}
+"""Arms of policies that were trained on with a diagnosis, and those that were without, by ends."""
 FLEETS = ("", f"+{DIAGNOSED}")
 """How arms end: trained for the fleet, and trained on with what its diagnoses share."""
 RATIOS = {
@@ -35,7 +37,13 @@ RATIOS = {
     "corrected / own, no trials": (f"{PUP}+corrected+fitted", f"{PUP}+own+fitted"),
     "corrected / fleet": (f"{PUP}+corrected", PUP),
     "diagnosed / fleet, no trials": (f"{PUP}+{DIAGNOSED}+fitted", f"{PUP}+fitted"),
+    "undiagnosed / fleet, no trials": (f"{PUP}+{UNDIAGNOSED}+fitted", f"{PUP}+fitted"),
+    "diagnosed / undiagnosed, no trials": (
+        f"{PUP}+{DIAGNOSED}+fitted",
+        f"{PUP}+{UNDIAGNOSED}+fitted",
+    ),
     "diagnosed / fleet": (f"{PUP}+{DIAGNOSED}", PUP),
+    "diagnosed / undiagnosed": (f"{PUP}+{DIAGNOSED}", f"{PUP}+{UNDIAGNOSED}"),
 }
 """Means that are compared, over the robots that have both."""
 UNCONTROLLED = ", not controlled for training budget"
@@ -102,12 +110,12 @@ def _control(
     It is where the same robots walked with one that was trained on as long without a diagnosis.
     """
     way = pair[0].split("+")[1] if "+" in pair[0] else ""
-    if way == OWN or way not in budgets or pair[1] not in (PUP, PUP + FITTED):
+    if way not in CONTROLS or way not in budgets or pair[1] not in (PUP, PUP + FITTED):
         return {}
-    control = f"{PUP}+{OWN}{pair[1].removeprefix(PUP)}"
+    control = f"{PUP}+{CONTROLS[way]}{pair[1].removeprefix(PUP)}"
     robots = _common(walks, pair)
     there = bool(robots) and set(robots) <= walks.get(control, {}).keys()
-    return {"controlled": there and budgets[OWN] >= budgets[way]}
+    return {"controlled": there and budgets[CONTROLS[way]] >= budgets[way]}
 
 
 def _above(walks: Mapping[str, Any], planned: Mapping[str, Any], end: str) -> dict[str, Any]:
