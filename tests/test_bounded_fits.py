@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from pup.diagnosis.coordinates import Coordinate
+from pup.diagnosis.coordinates import Belief, Coordinate
 from pup.diagnosis.evidence import Projector
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.folds import left_out
@@ -58,6 +58,16 @@ def test_one_at_an_end_that_would_rather_leave_it_can_move() -> None:
     for residual, movable in ((-1.0, True), (1.0, False)):
         fit = Fit((end,), np.ones(1), residual=residual * jacobian[:, 0], jacobian=jacobian)
         assert fit.movable.tolist() == [movable]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+def test_a_belief_pulls_to_where_it_costs_least(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    belief, at = Belief(rng.normal(size=n), rng.uniform(0.1, 9, n)), rng.normal(size=n)
+    step = 1e-4 * np.eye(n)
+    slope = [(belief.cost(at + s) - belief.cost(at - s)) / 2e-4 for s in step]
+    assert belief.pull(at) == pytest.approx(-np.array(slope) / 2, abs=1e-6)
+    assert belief.cost(belief.at) == 0 <= belief.cost(at)
 
 
 def test_leaving_out_samples_moves_nothing_through_a_wall() -> None:

@@ -1,10 +1,13 @@
 """Where fits of finalists begin: near the nominal fit, and at the robot's description."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fitting import Fit, complete, fit_together
+from pup.diagnosis.folds import NOMINAL, without_samples
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import free_names
@@ -39,6 +42,28 @@ def test_a_fit_that_ends_far_from_the_description_is_begun_there_too(replays: Re
     assert fit is not None and fit.jacobian is not None
     assert fit.values["kp/servo"] == pytest.approx(3.84)
     assert np.isfinite(fit.chi2)
+
+
+def test_what_the_other_motions_do_not_tell_stays_near_to_what_all_do() -> None:
+    """A slow triangle never comes to the torque's limit: noise alone would say what that is."""
+    measured = Measured.of(BENCH, recordings({}))
+    replays = Replays(measured, SPACE, threads(Bench(measured), 1), 1)
+    noise = assumed_noise(measured)
+    fit = nominal()
+    fit_together([fit], replays, noise)
+    complete([fit], replays, noise)
+    inside = ~measured.only(measured.motions()["triangle"])
+    held = without_samples(fit, inside)
+    assert held.belief is not None and held.belief.cost(held.at) == 0
+    free = replace(held, belief=None)
+    tight, loose = fit.names.index("kp/servo"), fit.names.index("tau_max/servo")
+    for one in (held, free):  # from where only the data could lead them back
+        one.at = fit.at.copy()
+        one.at[[tight, loose]] += [0.1, 0.4]
+        one.residual = one.jacobian = None
+        fit_together([one], replays, noise)
+    assert np.abs(free.at - fit.at)[loose] > 0.3 > NOMINAL > np.abs(held.at - fit.at)[loose]
+    assert np.abs(held.at - fit.at)[tight] < 0.02  # the others tell that well
 
 
 def test_what_explains_little_or_leaves_much_is_a_puzzle(replays: Replays) -> None:

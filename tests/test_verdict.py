@@ -18,6 +18,7 @@ from pup.diagnosis.verdict import (
     in_order,
     left_over,
     of_other_form,
+    shared,
     probabilities,
     twins_of,
 )
@@ -124,6 +125,21 @@ def test_findings_stand_by_what_they_explain_where_none_is_of_a_usual_size_for_s
     clock, ripple = found("clock_skew", 8000.0, 0.2), found("cogging", 400.0, 0.4, 0.3)
     nameless = found("unknown", 100.0, np.inf)
     assert in_order([nameless, ripple, clock]) == (clock, ripple, nameless)
+
+
+def test_two_forms_of_one_class_at_one_place_are_one_cause_that_is_either() -> None:
+    """Dry friction that only takes two laws together acts in a form of its own."""
+    friction, ripple = found("coulomb_friction", 900.0, 1.0), found("cogging", 400.0, 1.0)
+    hysteresis = found("presliding_hysteresis", 900.0, 1.0, 0.8)
+    told = shared([friction, ripple, hysteresis])
+    assert told[1] == ripple
+    for one, other in ((told[0], hysteresis), (told[2], friction)):
+        assert [e.effect for e in one.equivalents] == [other.effect] and one.believed
+    assert told[0].probability == told[0].equivalents[0].probability == 0.45
+    assert shared(told) == told  # a rival that is told already is not told twice
+    elsewhere = replace(hysteresis, place=Place("joint", "another"))
+    unlike = [friction, elsewhere, found("unknown", 9.0, 1.0), found("unknown", 8.0, 1.0)]
+    assert shared(unlike) == unlike
 
 
 def test_an_interval_is_as_wide_as_a_law_of_another_form_asks() -> None:

@@ -49,6 +49,27 @@ class Coordinate:
         return float(np.exp(coordinate)) if self.scale is None else self.scale
 
 
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Where coordinates are believed to lie, before data say anything.
+
+    Attributes:
+      at: shape (n_coordinates,).
+      precision: inverse variance of each, as chi-squared counts, same shape.
+    """
+
+    at: Array
+    precision: Array
+
+    def cost(self, at: Array) -> float:
+        """What it costs to lie elsewhere, as chi-squared."""
+        return float(self.precision @ (at - self.at) ** 2)
+
+    def pull(self, at: Array) -> Array:
+        """Half of that cost's slope downhill, shape (n_coordinates,)."""
+        return np.asarray(self.precision * (self.at - at))
+
+
 def nominal_coordinate(space: ParameterSpace, name: str) -> Coordinate:
     """The coordinate of a nominal parameter, which is positive."""
     i = space.names.index(name)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.coordinates import Coordinate
+from pup.diagnosis.coordinates import Belief, Coordinate
 from pup.diagnosis.probing import changes, probed
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
@@ -44,9 +44,10 @@ class Fit:
       fixed: other parameters that differ from their nominal values.
       weight: of the samples, shape (n_samples,): 0 leaves one out.
       data: what it fits, shape (n_samples,), rad; None for what was measured.
+      belief: where it is believed to lie; None where the samples alone say so.
       residual: whitened, measured minus simulated, shape (n_samples,).
       jacobian: of the simulated samples, whitened, shape (n_samples, n_free).
-      chi2: sum of squared weighted residuals.
+      chi2: sum of squared weighted residuals, and what it costs to leave what is believed.
       done: whether no step leads further.
       thorough: whether it ends on a Jacobian of where it stands, not on an updated one.
       damping: of Levenberg and Marquardt.
@@ -62,6 +63,7 @@ class Fit:
     fixed: Mapping[str, float] = field(default_factory=dict)
     weight: Array | None = None
     data: Array | None = None
+    belief: Belief | None = None
     residual: Array | None = None
     jacobian: Array | None = None
     chi2: float = np.inf
@@ -164,7 +166,7 @@ def start_best(
     simulated = replays([fit.row(at) for fit, at in tried])
     residuals = _residuals([fit for fit, _ in tried], simulated, replays, noise)
     for (fit, at), residual in zip(tried, residuals, strict=True):
-        chi2 = _chi2(fit, residual)
+        chi2 = _chi2(fit, residual, at)
         if chi2 < fit.chi2:
             fit.at, fit.residual, fit.chi2 = at, residual, chi2
 
@@ -241,7 +243,7 @@ def _begin(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     told = probed([(fit.row(), rows) for fit, (_, rows) in zip(fits, asked, strict=True)], replays)
     residuals = _residuals(fits, np.stack([base for base, _ in told]), replays, noise)
     for fit, residual, (steps, _), (_, changed) in zip(fits, residuals, asked, told, strict=True):
-        fit.residual, fit.chi2 = residual, _chi2(fit, residual)
+        fit.residual, fit.chi2 = residual, _chi2(fit, residual, fit.at)
         if fit.jacobian is None:
             fit.jacobian, fit.age = _jacobian(steps, changed, replays, noise), 0
 
@@ -254,9 +256,9 @@ def _residuals(fits: Sequence[Fit], simulated: Array, replays: Replays, noise: N
     return measured.whiten(errors, noise)
 
 
-def _chi2(fit: Fit, residual: Array) -> float:
+def _chi2(fit: Fit, residual: Array, at: Array) -> float:
     weighted = residual if fit.weight is None else residual * fit.weight
-    return float(weighted @ weighted)
+    return float(weighted @ weighted) + (fit.belief.cost(at) if fit.belief else 0.0)
 
 
 def difference(fit: Fit, i: int, at: Array) -> float:
@@ -287,14 +289,18 @@ def _normal(fit: Fit) -> tuple[Array, Array]:
     """The normal matrix, and half of chi-squared's slope downhill."""
     assert fit.jacobian is not None
     jacobian = fit.jacobian if fit.weight is None else fit.jacobian * fit.weight[:, None]
-    return jacobian.T @ jacobian, _downhill(fit)
+    normal = jacobian.T @ jacobian
+    if fit.belief:
+        normal[np.diag_indices_from(normal)] += fit.belief.precision
+    return normal, _downhill(fit)
 
 
 def _downhill(fit: Fit) -> Array:
     """Half of chi-squared's slope downhill, shape (n_free,)."""
     assert fit.jacobian is not None and fit.residual is not None
     squares = 1.0 if fit.weight is None else fit.weight**2
-    return np.asarray(fit.jacobian.T @ (fit.residual * squares))
+    pull = fit.belief.pull(fit.at) if fit.belief else 0.0
+    return np.asarray(fit.jacobian.T @ (fit.residual * squares) + pull)
 
 
 def _promise(fit: Fit, to: Array) -> float:
@@ -333,7 +339,7 @@ class _Reached:
 
 def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
     """Go where a trial is best, or ask for a fresh Jacobian, or stop."""
-    costs = [_chi2(fit, told.residual) for told in reached]
+    costs = [_chi2(fit, told.residual, told.at) for told in reached]
     best = int(np.argmin(costs))
     gain, fresh = fit.chi2 - costs[best], fit.age == 0
     kept = gain > RELIABLE * _promise(fit, reached[best].at)

@@ -1,9 +1,12 @@
 """Leaving out: what is left out together, and what it costs by a fit to the rest."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pup.diagnosis.coordinates import Belief, Coordinate
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
@@ -35,16 +38,46 @@ def left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:
     """
     assert fit.residual is not None
     jacobian, residual = fit.slopes, fit.residual
-    # What a model leaves counts as noise, else a wrong form would be sure of its parameters.
-    noise = max(1.0, fit.chi2 / len(residual))
-    scales = [c.scale for c in fit.coordinates]
-    reach = np.array([NOMINAL if scale is None else TYPICAL for scale in scales])[fit.movable]
+    noise = _noise(fit)
+    reach = _reach(fit.coordinates)[fit.movable]
     prior, outside = np.diag(1 / reach**2), jacobian[~inside]
     normal = outside.T @ outside / noise + prior
     step = np.linalg.solve(normal, outside.T @ residual[~inside] / noise)
     own, here = jacobian[inside], residual[inside]
     spread = np.linalg.slogdet(np.linalg.solve(normal, own.T @ own / noise) + np.eye(len(reach)))[1]
     return float(max(here @ (here - own @ step), here @ here) + spread)
+
+
+def without_samples(fit: Fit, inside: NDArray[np.bool_]) -> Fit:
+    """A fit to the other samples, which starts from one to all.
+
+    What the others do not tell is believed to be near to what all do, as in `left_out`; noise alone
+    would lead it anywhere.
+    """
+    assert fit.jacobian is not None and fit.residual is not None
+    weight = np.where(inside, 0.0, 1.0)
+    return Fit(
+        fit.coordinates,
+        fit.at,
+        fixed=fit.fixed,
+        weight=weight,
+        belief=Belief(fit.at, _noise(fit) / _reach(fit.coordinates) ** 2),
+        residual=fit.residual,
+        jacobian=fit.jacobian,
+        chi2=float((fit.residual * weight) @ fit.residual),
+        thorough=False,
+        age=1,
+    )
+
+
+def _noise(fit: Fit) -> float:
+    """What counts as noise: what a model leaves too, else a wrong form would be sure of itself."""
+    assert fit.residual is not None
+    return max(1.0, fit.chi2 / len(fit.residual))
+
+
+def _reach(coordinates: Sequence[Coordinate]) -> Array:
+    return np.array([NOMINAL if c.scale is None else TYPICAL for c in coordinates])
 
 
 def scatter(refits: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
-from pup.diagnosis.folds import folds, left_out
+from pup.diagnosis.folds import folds, left_out, without_samples
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
@@ -30,7 +30,6 @@ from pup.diagnosis.starts import (
     options,
     puzzling,
     started,
-    without_samples,
 )
 from pup.diagnosis.tracing import traces
 from pup.physics.terms import Place

@@ -23,6 +23,9 @@ LAST = 14
 """Steps of a finalist's fit to its end."""
 SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
+BESIDES = {"joint_stop": (1.0, 5.0, 25.0)}
+"""Sizes that a finalist may start at besides, in typical ones: what bounces has a minimum at many a
+stiffness, and slopes lead to the softest."""
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
 PUZZLING, GLARING = 0.5, 30.0
@@ -68,11 +71,15 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
     normal = slopes.T @ slopes
     normal[np.diag_indices_from(normal)] += 1 + DAMPED * np.diag(normal)
     low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
+    upper = [c.upper for c in fit.coordinates[n : n + len(sizes)]]
+    besides = BESIDES.get(score.trace.hypothesis.effect, ())
+    starts = [(share * sizes, share * sizes) for share in SHARES]
+    starts += [(np.minimum(np.full(len(sizes), size), upper), sizes) for size in besides]
     places = []
-    for share in SHARES:
+    for size, felt in starts:
         at = fit.at.copy()
-        at[n : n + len(sizes)] = share * sizes
-        left = slopes.T @ (before.residual - trace @ (share * sizes))
+        at[n : n + len(sizes)] = size
+        left = slopes.T @ (before.residual - trace @ felt)
         step = np.zeros(n)
         step[movable] = np.clip(np.linalg.solve(normal, left), -FURTHEST, FURTHEST)
         places += [at, np.r_[np.clip(before.at + step, low, high), at[n:]]]
@@ -134,23 +141,6 @@ def joined(fit: Fit, rival: Fit, own: Hypothesis) -> Fit:
         fixed={**fit.fixed, **{n: v for n, v in rival.fixed.items() if n in names}},
         thorough=False,
         slack=ROUGHLY,
-    )
-
-
-def without_samples(fit: Fit, inside: NDArray[np.bool_]) -> Fit:
-    """A fit to the other samples, which starts from one to all."""
-    assert fit.jacobian is not None and fit.residual is not None
-    weight = np.where(inside, 0.0, 1.0)
-    return Fit(
-        fit.coordinates,
-        fit.at,
-        fixed=fit.fixed,
-        weight=weight,
-        residual=fit.residual,
-        jacobian=fit.jacobian,
-        chi2=float((fit.residual * weight) @ fit.residual),
-        thorough=False,
-        age=1,
     )
 
 

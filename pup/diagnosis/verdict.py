@@ -17,7 +17,7 @@ from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector
-from pup.physics.terms import TERMS, Place, Quantity, split_column
+from pup.physics.terms import CLASS_OF, TERMS, Place, Quantity, split_column
 
 Array = NDArray[np.float64]
 Answer = Literal["mismatch", "none", "undetermined"]
@@ -209,7 +209,29 @@ def findings(
                 size=final.size(hypothesis),
             )
         )
-    return in_order(told)
+    return in_order(shared(told))
+
+
+def shared(found: Sequence[Finding]) -> list[Finding]:
+    """Findings, those of one class at one place each a rival of the other.
+
+    What takes two forms of a class at one place acts in neither of them but in one of its own, and
+    nobody can say which of the two that is nearer to.
+    """
+    told = []
+    for finding in found:
+        kin = [f for f in found if _same_cause(f, finding)]
+        known = {e.effect for e in finding.equivalents}
+        others = [f for f in kin if f is not finding and f.effect not in known]
+        share = finding.probability / (1 + len(others))
+        more = tuple(Alternative(f.effect, f.place, share) for f in others)
+        told.append(replace(finding, probability=share, equivalents=more + finding.equivalents))
+    return told
+
+
+def _same_cause(one: Finding, other: Finding) -> bool:
+    classes = CLASS_OF.get(one.effect), CLASS_OF.get(other.effect)
+    return one.place == other.place and None not in classes and classes[0] == classes[1]
 
 
 def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
