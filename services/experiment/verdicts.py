@@ -192,7 +192,13 @@ def _bars(direction: str, told: Mapping[str, Any]) -> list[dict[str, Any]]:
     for words, name, bar in (
         ("few trials with a prior by all", "prior / trials", 0.95),
         ("no trials, corrected simulator by the fleet's", "corrected / fleet, no trials", 1.3),
+        ("no trials, corrected simulator by the robot's own", "corrected / own, no trials", 1.3),
         ("no trials, diagnosed fleet by the fleet", "diagnosed / fleet, no trials", 1.3),
+        (
+            "no trials, diagnosed fleet by one trained on as long without",
+            "diagnosed / undiagnosed, no trials",
+            1.3,
+        ),
     ):
         lines.append(_line(f"{direction}: {words}", ratios.get(name), bar))
     return lines
