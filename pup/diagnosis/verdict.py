@@ -220,7 +220,7 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
     """
     told = []
     for finding in found:
-        kin = [f for f in found if _same_cause(f, finding)]
+        kin = [f for f in found if _cause(f) == _cause(finding)]
         known = {e.effect for e in finding.equivalents}
         others = [f for f in kin if f is not finding and f.effect not in known]
         share = finding.probability / (1 + len(others))
@@ -229,9 +229,8 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
     return told
 
 
-def _same_cause(one: Finding, other: Finding) -> bool:
-    classes = CLASS_OF.get(one.effect), CLASS_OF.get(other.effect)
-    return one.place == other.place and None not in classes and classes[0] == classes[1]
+def _cause(finding: Finding) -> tuple[object, Place]:
+    return CLASS_OF.get(finding.effect, finding), finding.place
 
 
 def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
