@@ -71,7 +71,7 @@ def test_what_explains_little_or_leaves_much_is_a_puzzle(replays: Replays) -> No
     before, after = nominal(), nominal()
     fit_together([before], replays, noise, iterations=0)
     samples = len(replays.measured.values)
-    for much, left, puzzle in ((11, 3, True), (11, 1.9, False), (1001, 3, False), (1001, 33, True)):
+    for much, left, puzzle in ((11, 10, True), (11, 3, False), (1001, 3, False), (1001, 33, True)):
         before.chi2, after.chi2 = float(much * samples), float(left * samples)
         assert puzzling(before, [((), after)]) is puzzle
     assert puzzling(before, [])

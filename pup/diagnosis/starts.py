@@ -28,7 +28,7 @@ BESIDES = {"joint_stop": (1.0, 5.0, 25.0)}
 stiffness, and slopes lead to the softest."""
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
-PUZZLING, GLARING = 0.1, 30.0
+PUZZLING, GLARING = 0.5, 30.0
 """Where the best of all effects leaves this share of what is more than noise, or so many times the
 noise, they are begun elsewhere too: the right one may have stopped halfway, as a gear's friction
 that all but holds its joint."""
