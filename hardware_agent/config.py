@@ -17,7 +17,6 @@ from pup.robot_toml import Table, read_text
 LIMIT = 2**18  # bytes
 ADDRESS = re.compile(r"tcp://[^\s*]+:\d+")
 AXIS = re.compile(r"[+-]?[xyz]")
-ANGLE = re.compile(r"[+-]?(heading|roll|pitch)")
 
 
 @dataclass(frozen=True)
@@ -58,18 +57,13 @@ class ImuSettings:
     Attributes:
       kind: "bno055-uart", "bno055-i2c", "cm740" (the board's own, on the servo bus) or "none".
       port: serial device, or number of the I2C bus.
-      roll: which angle of the BNO055 is the torso's roll; the defaults are the authors' mounting.
-      pitch: likewise; leaning forward must be positive.
-      yaw: likewise.
-      axes: sensor axes that point along the torso's x (forward), y (left) and z (up).
+      axes: the BNO055's axes that point along the torso's x (forward), y (left) and z (up); the
+        default is the authors' mounting. Roll, pitch, rates and accelerations follow from it.
       timeout: largest delay of an answer beside its time on the wire, s.
     """
 
     kind: str = "none"
     port: str = ""
-    roll: str = "-roll"
-    pitch: str = "pitch"
-    yaw: str = "-heading"
     axes: tuple[str, ...] = ("y", "-x", "z")
     timeout: float = 0.004
 
@@ -309,6 +303,9 @@ def _path(table: Table, key: str, file: Path) -> Path:
 
 
 def _part(table: Table, kind: type[Any]) -> Any:
+    for key in ("roll", "pitch", "yaw") if kind is ImuSettings else ():
+        if table.has(key):
+            raise table.mistake(key, "no longer a setting; imu.axes tells the whole mounting")
     hints, read = get_type_hints(kind), {}
     for f in fields(kind):
         if table.has(f.name) or (f.name == "port" and kind is BusSettings):
@@ -368,13 +365,13 @@ def _mistakes(part: Any) -> Any:
     if isinstance(part, ImuSettings):
         if part.kind.startswith("bno055") and not part.port:
             yield "port", f"missing; where is the {part.kind}?"
-        for key in ("roll", "pitch", "yaw"):
-            if not ANGLE.fullmatch(getattr(part, key)):
-                yield key, f"{getattr(part, key)!r}; use heading, roll or pitch, perhaps with a -"
         if len(part.axes) != 3 or not all(AXIS.fullmatch(axis) for axis in part.axes):
             yield "axes", 'write three of x, y, z, perhaps with a -, such as ["y", "-x", "z"]'
         elif len({axis[-1] for axis in part.axes}) < 3:
             yield "axes", "names an axis twice"
+        # An even order of the axes goes with an even number of minuses.
+        elif ("".join(a[-1] for a in part.axes) in "xyzxy") == "".join(part.axes).count("-") % 2:
+            yield "axes", "is a mirror image, which no mounting gives; check the signs"
     if isinstance(part, SafetySettings) and (
         len(part.voltage) != 2 or not part.voltage[0] < part.voltage[1]
     ):

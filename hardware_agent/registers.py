@@ -174,10 +174,18 @@ def hardware_alarm(bits: int) -> str:
 def board_senses(
     data: bytes,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
-    """Gyro x, y, z in rad/s, accelerometer x, y, z in m/s², and voltage of BOARD_SENSES."""
-    z, y, x, *accel = ((_word(data, 2 * i) - 512) / 512 for i in range(6))
-    ax, ay, az = (ACCEL_FULL * a for a in accel)
-    return (GYRO_FULL * x, GYRO_FULL * y, GYRO_FULL * z), (ax, ay, az), data[12] / 10
+    """Gyro in rad/s and accelerometer in m/s², along the torso's axes, and voltage.
+
+    As ROBOTIS' framework reads them: the accelerometer's x points to the right and its y forward
+    (y below 390 is a fall forward); the gyro's x and y turn against the torso's roll and pitch, or
+    the gyro's part in the framework's walk would push the robot over.
+
+    Args:
+      data: of BOARD_SENSES.
+    """
+    z, y, x, right, ahead, up = ((_word(data, 2 * i) - 512) / 512 for i in range(6))
+    gyro = -GYRO_FULL * x, -GYRO_FULL * y, GYRO_FULL * z
+    return gyro, (ACCEL_FULL * ahead, -ACCEL_FULL * right, ACCEL_FULL * up), data[12] / 10
 
 
 def _alarm(protocol: int, error: int) -> str:

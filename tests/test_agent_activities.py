@@ -81,7 +81,8 @@ def test_an_imu_that_was_reset_tells_nothing() -> None:
 
         def take(self, length: int) -> bytes:
             gravity = bytes(4) + (981).to_bytes(2, "little") + bytes(18)
-            return gravity if self.mode == IMU_MODE else bytes(24)
+            turn = (1 << 14).to_bytes(2, "little") + bytes(6)
+            return gravity + turn if self.mode == IMU_MODE else bytes(32)
 
     imu = Bno055(ImuSettings(), Registers())
     assert imu.take(None, 0.0) is None

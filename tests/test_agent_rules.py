@@ -315,7 +315,7 @@ def test_the_boards_own_sensors_find_the_tilt() -> None:
     for k in range(300):
         pitch = 0.0 if k == 0 else 0.3
         x, z = -math.sin(pitch) * 512 / 4, math.cos(pitch) * 512 / 4
-        values = [512, 512, 512, round(512 + x), 512, round(512 + z)]
+        values = [512, 512, 512, 512, round(512 + x), round(512 + z)]
         data = b"".join(v.to_bytes(2, "little") for v in values) + bytes([118])
         told = filtered.take(data, k * PERIOD)
     assert told is not None

@@ -275,6 +275,8 @@ def test_boards_sensors(one: Bench) -> None:
     force = (np.array([x, y, z]) - 512) / 512 * 4 * 9.81
     assert np.linalg.norm(force) == pytest.approx(9.81, abs=0.5)
     assert force[2] > 9.0
+    lean = math.sin(one.side("pose")["tilt"][1])
+    assert lean > 0.1 and force[1] == pytest.approx(-9.81 * lean, abs=1.0), "forward: below 512"
     for address in (38, 40, 42):
         assert abs(one.read(BOARD, address, 2) - 512) < 10
     assert one.read(BOARD, 30, 1) == 0
@@ -294,7 +296,7 @@ def test_bno055(one: Bench) -> None:
         assert ask(1, 0x00, 1, answer=3) == b"\xbb\x01\xa0"
         assert ask(0, 0x3D, 1, 0x00, answer=2) == b"\xee\x01"
         assert ask(1, 0x1A, 6, answer=8)[2:] == bytes(6)  # no fusion in the configuration mode
-        assert ask(0, 0x3B, 1, 0x00, answer=2) == b"\xee\x01"
+        assert ask(0, 0x3B, 1, 0x80, answer=2) == b"\xee\x01"
         assert ask(0, 0x3D, 1, 0x0C, answer=2) == b"\xee\x01"
         one.side("wait", time=0.1)
         heading, roll, pitch = np.frombuffer(ask(1, 0x1A, 6, answer=8)[2:], "<i2") / 16

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from test_agent_imu import Wire
 from virtual_robots import DARWIN
 
-from hardware_agent.virtual.bno055 import LYING, euler
+from hardware_agent.config import ImuSettings
+from hardware_agent.imu import Bno055
+from hardware_agent.virtual.bno055 import LYING, angles
 from hardware_agent.virtual.drives import AMBIENT, TICK
 from hardware_agent.virtual.faults import Faults
 from hardware_agent.virtual.fleet import Fleet
@@ -209,15 +212,22 @@ def test_imu_is_late() -> None:
     assert np.array(seen[3]).all()
 
 
+@pytest.mark.parametrize("android", [True, False])
 @pytest.mark.parametrize(
     ("roll", "pitch", "yaw"), [(0.2, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0)]
 )
-def test_bno055_angles_follow_the_authors_signs(roll: float, pitch: float, yaw: float) -> None:
-    """Darwin's roll = -euler[1], its pitch = euler[2]; the heading turns clockwise."""
+def test_bno055_angles_follow_the_authors_signs(
+    roll: float, pitch: float, yaw: float, android: bool
+) -> None:
+    """Darwin's roll = -euler[1], its pitch = euler[2] by Android's convention, which they had.
+
+    Windows' turns the pitch alone; the heading turns clockwise by both.
+    """
     half = np.array([roll, pitch, yaw]) / 2
     turn = np.array([np.cos(np.linalg.norm(half)), *(np.sinc(np.linalg.norm(half) / np.pi) * half)])
-    heading, about_y, about_x = euler(multiply(turn, LYING), android=False)
-    assert (-about_y, about_x) == pytest.approx((roll, pitch), abs=1e-9)
+    heading, told_roll, told_pitch = angles(multiply(turn, LYING), android)
+    sign = 1 if android else -1
+    assert (-told_roll, sign * told_pitch) == pytest.approx((roll, pitch), abs=1e-9)
     assert (np.pi / 2 - yaw) % (2 * np.pi) == pytest.approx(heading, abs=1e-9)
 
 
@@ -360,15 +370,17 @@ def test_fleet_is_what_is_behind_the_bus() -> None:
         late.clear()
     robot.release()
     robot.advance(1.0)
-    assert robot.imu.feed(b"\xaa\x00\x3b\x01\x00\xaa\x00\x3d\x01\x0c") == [b"\xee\x01"] * 2
+    imu = Bno055(ImuSettings(), Wire(robot.imu))
+    assert imu.configure()
     for k in range(20):
         position, tilt = fleet.observe()
         told = [servo.read(36, 2) for servo in robot.servos]
         counts = np.array([int.from_bytes(raw, "little") for raw in told])
         assert np.array_equal((counts - 2048) * TICK, position[0])
-        (answer,) = robot.imu.feed(b"\xaa\x01\x1a\x06")
-        _, roll, pitch = np.radians(np.frombuffer(answer[2:], "<i2") / 16)
-        assert (-roll, pitch) == pytest.approx(tuple(tilt[0]), abs=1e-12)
+        imu.ask()
+        agents = imu.take(None, 0.0)
+        assert agents is not None
+        assert (agents.roll, agents.pitch) == pytest.approx(tuple(tilt[0]), abs=1e-12)
         goal = np.rint(ticks(START * (1 - 0.01 * k)))
         fleet.command(np.tile((goal - 2048) * TICK, (2, 1)), 0.03)
         for servo, count in zip(robot.servos, goal, strict=True):

@@ -1,14 +1,14 @@
 """A BNO055 behind its UART: register protocol and the registers that a robot reads.
 
 Bosch BST-BNO055-DS000, sections 3.6 (fusion output), 4 (registers) and 4.7 (UART protocol). The
-chip lies on the torso as in the paper's authors' robot, x to the right, y forward, z up: what it
-calls -roll and pitch are the torso's roll and pitch.
+chip lies on the torso as in the paper's authors' robot, x to the right, y forward, z up: where the
+torso leans one way alone, what it calls -roll and, by Android's convention, pitch are the torso's.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_agent.virtual.imu import multiply
+from hardware_agent.virtual.imu import conjugate, multiply
 from hardware_agent.virtual.plant import Plant
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ WRITABLE = frozenset((PAGE_ID, UNITS, MODE, POWER, TRIGGER, 0x40, AXES, SIGNS, *
 RESET = 0x20  # bit of the trigger register
 RADIANS_PER_S, RADIANS, ANDROID = 1 << 1, 1 << 2, 1 << 7  # bits of the unit register
 DEGREES, MILLIRADIANS = 16 * 180 / np.pi, 900.0  # counts per rad or rad/s in either unit
+UNIT = 1 << 14  # counts of a quaternion
 LYING = np.array([np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)])
 """The chip in the torso: its x is the torso's -y, its y the torso's x."""
 
@@ -133,8 +134,8 @@ class Bno055:
         speed = MILLIRADIANS if unit & RADIANS_PER_S else DEGREES
         self._put(FORCE, force * 100)
         self._put(GYRO, rate * speed)
-        self._put(EULER, euler(turn, bool(unit & ANDROID)) * angle)
-        self._put(QUATERNION, turn * (1 << 14))
+        self._put(EULER, angles(turn, bool(unit & ANDROID)) * angle)
+        self._put(QUATERNION, turn * UNIT)
         self._put(LINEAR, (force - down) * 100)
         self._put(GRAVITY, down * 100)
         registers[TEMPERATURE], registers[CALIBRATION] = 30, 0x3F
@@ -144,19 +145,35 @@ class Bno055:
         self._registers[register : register + len(raw)] = raw
 
 
-def euler(turn: Array, android: bool) -> Array:
+def angles(turn: Array, android: bool) -> Array:
     """Heading, roll and pitch of the chip as it tells them, rad.
+
+    Heading, roll and Android's pitch turn left-handed about z, y and x, Windows' pitch
+    right-handed. Table 3-13 has the conventions differ in the pitch but does not say from where its
+    "clockwise" is seen: the authors' signs do, which were read by Android's convention.
 
     Args:
       turn: from the chip to the world, a quaternion.
-      android: whether the unit register says Android, not Windows, which turns the pitch's sign.
+      android: whether the unit register says Android, not Windows.
     """
     w, x, y, z = turn
     about_z = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     about_y = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     about_x = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = about_x if android else -about_x
+    pitch = -about_x if android else about_x
     return np.array([-about_z % (2 * np.pi), -about_y, pitch])
+
+
+def lean(turn: Array) -> tuple[float, float]:
+    """Roll and pitch of the torso (Z-Y-X), rad, as the quaternion's registers tell them.
+
+    Args:
+      turn: from the torso to the world, a quaternion.
+    """
+    told = multiply(np.rint(multiply(turn, LYING) * UNIT), conjugate(LYING))
+    w, x, y, z = told / np.linalg.norm(told)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return float(roll), float(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)))
 
 
 def _lying(vector: Array) -> Array:

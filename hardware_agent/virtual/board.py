@@ -10,7 +10,12 @@ from hardware_agent.virtual.tables import CM740, Register
 RATE = np.radians(500.0)  # rad/s of half the scale
 FORCE = 4 * 9.81  # m/s2 of half the scale
 HALF, LARGEST = 512, 1023
-AXES = {"x": 0, "y": 1, "z": 2}
+AXES = {
+    **{"gyro_x": (-1, 0), "gyro_y": (-1, 1), "gyro_z": (1, 2)},
+    **{"acc_x": (-1, 1), "acc_y": (1, 0), "acc_z": (1, 2)},
+}
+"""Sign and axis of the torso that a register tells, after ROBOTIS' framework: its balance in
+walking and its detection of falls need them so."""
 
 
 class Board(Device):
@@ -36,14 +41,14 @@ class Board(Device):
     def refresh(self, registers: list[Register]) -> None:
         """Read the sensors."""
         for register in registers:
-            kind, _, axis = register.name.partition("_")
             if register.name == "present_voltage":
                 volts = self.plant.drives.volts[self.lane, 0]
                 self.memory.put(register.name, round(float(volts) * 10))
             elif register.name == "button":
                 self.memory.put("button", self.button)
-            elif kind in ("gyro", "acc") and self.plant.imus is not None:
+            elif register.name in AXES and self.plant.imus is not None:
+                sign, axis = AXES[register.name]
                 _, rate, force = self.plant.imus.read(self.lane)
-                share = rate / RATE if kind == "gyro" else force / FORCE
-                value = HALF + round(float(share[AXES[axis]]) * HALF)
+                share = rate / RATE if register.name.startswith("gyro") else force / FORCE
+                value = HALF + sign * round(float(share[axis]) * HALF)
                 self.memory.put(register.name, min(max(value, 0), LARGEST))

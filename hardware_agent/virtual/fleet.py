@@ -9,9 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_agent.virtual.bno055 import DEGREES, LYING, euler
+from hardware_agent.virtual.bno055 import lean
 from hardware_agent.virtual.drives import CENTRE, TICK
-from hardware_agent.virtual.imu import multiply
 from hardware_agent.virtual.plant import Plant
 from hardware_agent.virtual.servo import damping
 from hardware_agent.virtual.skeleton import STEP
@@ -66,7 +65,9 @@ class Fleet:
         Returns:
           Positions, rad, shape (n, n_joints), and the torso's roll and pitch, rad, shape (n, 2).
         """
-        tilt = np.array([self._tilt(lane) for lane in range(len(self))])
+        imus = self.plant.imus
+        assert imus is not None
+        tilt = np.array([lean(imus.read(lane)[0]) for lane in range(len(self))])
         return (self.plant.encoders() - CENTRE) * TICK, tilt
 
     def command(self, targets: Array, period: float) -> None:
@@ -79,12 +80,6 @@ class Fleet:
         for lane, goal in enumerate(_ticks(targets)):
             self.plant.order(lane, slice(None), goal)
         self.plant.step(round(period / STEP))
-
-    def _tilt(self, lane: int) -> tuple[float, float]:
-        assert self.plant.imus is not None
-        turn = multiply(self.plant.imus.read(lane)[0], LYING)
-        _, roll, pitch = np.rint(euler(turn, android=False) * DEGREES) / DEGREES
-        return -float(roll), float(pitch)
 
 
 def _ticks(angles: Array) -> Array:
