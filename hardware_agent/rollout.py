@@ -78,9 +78,7 @@ class Rollout:
         if card.shape.latent and not all(abs(x) <= EDGE for x in eta):
             # The card's box is of a sample of projections; a fitted robot's may lie beyond it.
             raise InputError(f"eta {list(eta)} is outside -1 to 1, where all projections lie")
-        low, high = card.rates
-        if not low * 0.99 <= rate <= high * 1.01:
-            raise InputError(f"the policy was trained for {low:g} to {high:g} Hz, not {rate:g}")
+        card.check_rate(rate)
         self._policy, self._eta = policy, np.array(eta, dtype=np.float64)
         self._columns = columns(card.joints, card.observation)
         self._offset = card.gait.imu_pitch_offset

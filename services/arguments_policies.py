@@ -156,6 +156,14 @@ def replay(verb: argparse.ArgumentParser) -> None:
         help="study.json of pup transfer: make the walks of its trials again in simulation "
         "instead, and compare; writes rehearsal.json and rehearsal.png",
     )
+    walk.add_argument(
+        "--rate",
+        type=number(1.0, 500.0, float),
+        metavar="HZ",
+        help="control rate of --landscape and --study, that of the robot's agent; default: that of "
+        "the study's recordings, where they lie beside it in agent/recordings/, else the fastest "
+        "that the policy was trained for, such as an agent's 33",
+    )
     seed(walk)
 
 

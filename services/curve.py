@@ -1,12 +1,16 @@
-"""The plot of a training's curve."""
+"""A training's curve: a point for each iteration, and the plot."""
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pup.files import write_atomic
 from pup.sysid.figures import BLUE, as_png, drawing_style, new_figure
+
+if TYPE_CHECKING:
+    from workers.ppo import Iteration
 
 PANELS = (
     ("distance", "distance at the end of an episode, m"),
@@ -14,6 +18,29 @@ PANELS = (
     ("reward", "reward of a step"),
     ("kl", "divergence of an iteration, nats"),
 )
+
+
+def point(told: "Iteration", before: int, seconds: float) -> dict[str, Any]:
+    """A point of the curve; nothing where no episode ended.
+
+    Args:
+      told: what the iteration came to.
+      before: steps sampled before it.
+      seconds: of the training so far.
+    """
+    means = told.ended.mean(axis=0) if len(told.ended) else np.full(4, np.nan)
+    names = ("return", "distance", "time", "fell")
+    row = {
+        "steps": before + told.steps,
+        "seconds": seconds,
+        "episodes": len(told.ended),
+        **dict(zip(names, map(float, means), strict=True)),
+        "reward": told.reward,
+        "sampling_seconds": told.seconds[0],
+        "learning_seconds": told.seconds[1],
+        **told.learnt,
+    }
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
 def draw_curve(file: Path, document: dict[str, Any]) -> None:

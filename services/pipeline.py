@@ -264,6 +264,7 @@ class _Job:
 
         inputs = _described(half) | self._hash(half.at(BOUNDS), study)
         inputs |= {"policy": sha256(policy / CARD), "seed": str(seed)}
+        inputs |= {"control rate": "of the recordings"}  # it was drawn once
         stage = self._alone(half, "rehearsal", inputs, [half.at(f"rehearsal/{FILE}")], work)
         return replace(stage, pictures=(half.at(f"rehearsal/{PICTURE}"),))
 

@@ -7,7 +7,7 @@ there (the correlation is Kadian et al. 2020's, of ranks).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from pup.locomotion.landscape import walk_each
 from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.settings import Direction, TaskSettings
 from pup.policy.bundle import CARD, NumpyPolicy
+from pup.recording import load_recordings
 from pup.robot import RobotDescription
 from pup.sysid.figures import INK, SOFT, as_png, drawing_style, new_figure
 from pup.sysid.result import read_bounds
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 SCHEMA = 1
 FILE, PICTURE = "rehearsal.json", "rehearsal.png"
 EPISODES = 8
-"""Of each eta: readings are noisy, and the control rate is drawn for each."""
+"""Of each eta: readings are noisy, and starts differ."""
 SHORT = 0.5
 """Share of the other's time before a fall below which a simulator and a robot do not walk alike."""
 
@@ -47,6 +48,7 @@ class Walked:
       time: means, before a fall, s, shape (n,).
       walks: of each, shape (n,).
       horizon: of the longest walk, s.
+      recordings: names of those that were made of the walks.
     """
 
     eta: Array
@@ -54,6 +56,7 @@ class Walked:
     time: Array
     walks: NDArray[np.int64]
     horizon: float
+    recordings: tuple[str, ...]
 
 
 def rehearse(
@@ -64,6 +67,7 @@ def rehearse(
     out: Path,
     seed: int,
     threads: int,
+    rate: float | None = None,
 ) -> dict[str, Any]:
     """Walk the trials of a study again, with the fitted parameters of a simulator.
 
@@ -75,17 +79,23 @@ def rehearse(
       out: folder for `rehearsal.json` and `rehearsal.png`.
       seed: of everything random.
       threads: cores to use.
+      rate: of control, Hz; None for that of the walks' recordings, which lie where a laboratory
+        leaves them beside the study, and where none do for the policy's fastest, as agents have it.
 
     Returns:
       The document of `rehearsal.json`.
 
     Raises:
-      InputError: the policy is not this robot's, or the study is none of this policy.
+      InputError: the policy is not this robot's, the study is none of this policy, or the policy
+        was not trained for the rate.
     """
     bundle, digest = NumpyPolicy.load(policy, robot), sha256(policy / CARD)
     walked = read_walked(study, bundle, digest)
     fitted = read_bounds(bounds, robot)
-    task = TaskSettings.of(robot, Direction(bundle.card.direction)).evaluation()
+    if rate is None:
+        rate = recorded_rate(study.parent, walked.recordings, robot) or bundle.card.rates[1]
+    bundle.card.check_rate(rate)
+    task = TaskSettings.of(robot, Direction(bundle.card.direction)).evaluation(rate)
     # The error of an IMU is drawn anew for each walk in a training; a robot has the one it has.
     task = replace(task, horizon=walked.horizon, tilt_bias=0.0)
     eta = np.repeat(walked.eta, EPISODES, axis=0)
@@ -101,6 +111,7 @@ def rehearse(
         "study_sha256": sha256(study),
         "policy_sha256": digest,
         "bounds_sha256": sha256(bounds),
+        "control_rate": rate,
         "episodes": EPISODES,
         "etas": _etas(walked, distance, time),
         **_summary(walked, distance.mean(axis=1), time.mean(axis=1)),
@@ -130,6 +141,7 @@ def read_walked(file: Path, policy: NumpyPolicy, digest: str) -> Walked:
         ended = [t for t in told["trials"] if t["state"] == TrialState.SUCCEEDED]
         rows = [(tuple(map(float, t["eta"])), (t["distance"], t["time"])) for t in ended]
         values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 2)
+        recordings = tuple(name for t in ended if (name := t.get("recording")))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file}: not a study.json of `pup transfer`") from error
     if whose != digest:
@@ -143,7 +155,22 @@ def read_walked(file: Path, policy: NumpyPolicy, digest: str) -> Walked:
     member = np.array([[eta == of for eta, _ in rows] for of in etas])
     count = member.sum(axis=1)
     distance, time = (member @ values / count[:, None]).T
-    return Walked(np.array(etas), distance, time, count, horizon)
+    return Walked(np.array(etas), distance, time, count, horizon, recordings)
+
+
+def recorded_rate(folder: Path, names: Sequence[str], robot: RobotDescription) -> float | None:
+    """At which the control loop really went, Hz; None where no recording lies beside the study.
+
+    Args:
+      folder: of the study.
+      names: of the recordings of its walks.
+      robot: that walked.
+    """
+    files = [folder / "agent" / "recordings" / f"{name}.parquet" for name in names]
+    if not (there := [file for file in files if file.is_file()]):
+        return None
+    ticks = [np.diff(recording.time) for recording in load_recordings(there, robot)]
+    return float(1 / np.median(np.concatenate(ticks)))
 
 
 def _etas(walked: Walked, distance: Array, time: Array) -> list[dict[str, Any]]:

@@ -31,7 +31,8 @@ from pup.sysid.problem import MODEL
 from pup.sysid.result import read_bounds
 from services import stopping
 from services.checkpoint import Checkpoint
-from services.curve import draw_curve
+from services.curve import draw_curve, point
+from services.failures import FailedError
 from services.first_gait import FirstGait, Said, read_gait
 from services.provenance import ALSO, engine, now
 from services.tracking import Trackers
@@ -179,7 +180,7 @@ class _Job:
         begin = time.monotonic()
         told = self._sampled(trainer)
         self.seconds += time.monotonic() - begin
-        row = _row(told, self.rows[-1]["steps"] if self.rows else 0, self.seconds)
+        row = point(told, self.rows[-1]["steps"] if self.rows else 0, self.seconds)
         self.rows.append(row)
         self.asked += self._per_iteration(self.options.runners)
         self.told(row, self.options.steps)
@@ -198,6 +199,7 @@ class _Job:
 
         Raises:
           ConnectionError: they do not come back.
+          FailedError: nothing was learnt from what they sampled.
         """
         trouble = ""
         for turn in range(MOST_EMPTY):
@@ -209,6 +211,12 @@ class _Job:
             if told.trouble and told.trouble != trouble:
                 trouble = told.trouble
                 print(f"{told.lost} steps lost: {trouble}", file=sys.stderr, flush=True)
+            if told.stuck:
+                raise FailedError(
+                    f"no gradient of iteration {len(self.rows) + 1} was finite, so that nothing is "
+                    "learnt any more; begin again in another --out with a lower --learning-rate or "
+                    "another --seed"
+                )
             if told.steps:
                 return told
         raise ConnectionError(
@@ -363,7 +371,8 @@ class _Job:
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     def _document(self, done: bool) -> dict[str, Any]:
-        columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
+        # The first rows may be of a pup that told less.
+        columns = {name: [row.get(name) for row in self.rows] for name in self.rows[-1]}
         return {
             "schema": 1,
             "robot": self.robot.name,
@@ -385,20 +394,3 @@ class _Job:
                 "engine": engine(ALSO),
             },
         }
-
-
-def _row(told: Iteration, before: int, seconds: float) -> dict[str, Any]:
-    """A point of the curve; nothing where no episode ended."""
-    means = told.ended.mean(axis=0) if len(told.ended) else np.full(4, np.nan)
-    names = ("return", "distance", "time", "fell")
-    row = {
-        "steps": before + told.steps,
-        "seconds": seconds,
-        "episodes": len(told.ended),
-        **dict(zip(names, map(float, means), strict=True)),
-        "reward": told.reward,
-        "sampling_seconds": told.seconds[0],
-        "learning_seconds": told.seconds[1],
-        **told.learnt,
-    }
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

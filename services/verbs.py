@@ -178,6 +178,8 @@ def _walk(options: argparse.Namespace) -> dict[str, Any]:
     robot = RobotDescription.load(options.robot)
     if options.study:
         return _rehearse(robot, options)
+    if options.rate is not None and not options.landscape:
+        raise InputError("--rate is that of --landscape and --study; give one of them too")
     shown = Shown(
         options.policy,
         options.bounds,
@@ -185,6 +187,7 @@ def _walk(options: argparse.Namespace) -> dict[str, Any]:
         options.episodes,
         options.landscape,
         options.seed,
+        options.rate,
     )
     with _folder(options.out) as out:
         return walk(robot, shown, out, places.cores(options))
@@ -196,8 +199,9 @@ def _rehearse(robot: RobotDescription, options: argparse.Namespace) -> dict[str,
     if options.eta is not None or options.landscape:
         raise InputError("--study walks the etas of its trials; leave out --eta and --landscape")
     bounds, cores = options.bounds or robot.identified_path, places.cores(options)
+    given = options.policy, bounds, options.study
     with _folder(options.out) as out:
-        return rehearse(robot, options.policy, bounds, options.study, out, options.seed, cores)
+        return rehearse(robot, *given, out, options.seed, cores, options.rate)
 
 
 def _diagnose(options: argparse.Namespace) -> dict[str, Any]:

@@ -38,6 +38,7 @@ class Shown:
       landscape: etas that are walked with 16 draws of the parameters, for `pup transfer
         --simulated`; 0 for none.
       seed: of everything random.
+      rate: of control in these, Hz; None for the policy's fastest, as agents have it.
     """
 
     policy: Path
@@ -46,6 +47,7 @@ class Shown:
     episodes: int = 50
     landscape: int = 0
     seed: int = 0
+    rate: float | None = None
 
 
 def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict[str, Any]:
@@ -64,7 +66,7 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
       The document of `replay.json`.
 
     Raises:
-      InputError: the policy, the bounds or eta do not fit.
+      InputError: the policy, the bounds, eta or the rate do not fit.
     """
     policy = NumpyPolicy.load(shown.policy, robot)
     bounds = read_bounds(shown.bounds or robot.identified_path, robot)
@@ -73,6 +75,8 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     if shown.landscape and not policy.card.shape.eta:
         raise InputError(f"{shown.policy}: is conditioned on nothing; leave --landscape out")
     settings = TaskSettings.of(robot, Direction(policy.card.direction)).evaluation()
+    rate = shown.rate or policy.card.rates[1]
+    policy.card.check_rate(rate)
 
     def act(seen: NDArray[np.float32], mu: NDArray[np.float32]) -> Array:
         return policy.act(seen, policy.project(mu) if eta is None else eta)
@@ -86,7 +90,8 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     draw_gait(out / "gait.png", robot, footage)
     if shown.landscape:
         file, etas = out / "simulated.json", shown.landscape
-        write_landscape(file, robot, policy, bounds, settings, etas, shown.seed, threads)
+        known = settings.evaluation(rate)
+        write_landscape(file, robot, policy, bounds, known, etas, shown.seed, threads)
     video, drawn = film(out / "walk", robot, footage)
     document = {
         "schema": 1,
@@ -131,7 +136,7 @@ def write_landscape(
       robot: the robot.
       policy: that is conditioned on eta.
       bounds: of the robot's parameters.
-      settings: of the task.
+      settings: of the task; its control rates are told in the file.
       etas: points of the box.
       seed: of everything random.
       threads: cores to use.
@@ -140,7 +145,8 @@ def write_landscape(
     points = qmc.Sobol(card.shape.eta, seed=seed).random(etas)
     eta = qmc.scale(points, card.eta_lower, card.eta_upper)
     distance = landscape(policy.act, robot, bounds, settings, eta, DRAWS, seed, threads)
-    write_json(file, {"schema": 1, "eta": eta.tolist(), "distance": distance.tolist()})
+    told = {"schema": 1, "control_rate": list(settings.control_rate), "eta": eta.tolist()}
+    write_json(file, told | {"distance": distance.tolist()})
 
 
 def _eta(policy: NumpyPolicy, told: tuple[float, ...]) -> Array:

@@ -1,21 +1,27 @@
 """Plans of experiments, the cells that they mean, and what these depend on."""
 
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import agents
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pup.errors import InputError
+from pup.files import read_json, sha256
 from pup.locomotion.settings import Direction
 from pup.policy.shape import Method
+from pup.robot import RobotDescription
 from services.arguments import parser
 from services.experiment.cells import chosen, graph
 from services.experiment.plan import MOST, STAGES, Plan, Walk, meant, read_plan, small, training
+from services.experiment.work import Task, landscape
 from services.gateway.limits import SEEDS
+from services.transfer import read_simulated
 
 DOCUMENTED = Path(__file__).parents[1] / "docs" / "experiment.md"
 
@@ -174,6 +180,21 @@ def test_a_diagnosed_fleet_is_what_its_corrected_robots_share() -> None:
     assert {cell.kind for cell in known.values()} == {"record", "presysid", "policy", "trials"}
     alone = graph(replace(small(), seeds=(1000,), stages=("diagnosed",)))
     assert not alone  # one robot shares nothing
+
+
+def test_landscapes_are_of_the_rate_that_is_walked_at(tmp_path: Path) -> None:
+    """A cell is told it, and its file tells it."""
+    walks = replace(small(), trials=replace(small().trials, landscape=2, horizon=0.2))
+    cell = graph(replace(walks, stages=("prior",)))["landscape-forward-pup"]
+    assert cell.told["rate"] == pytest.approx(1 / 0.031)
+    robot = RobotDescription.load(cell.given["robot"])
+    shutil.copytree(robot.folder / "policies" / "forward", tmp_path / "policy")
+    shutil.copy(robot.identified_path, tmp_path / "bounds.json")
+    told = landscape(Task(cell, tmp_path, {"policy": tmp_path, "bounds": tmp_path}))
+    file = tmp_path / "simulated.json"
+    assert told["simulated"] == sha256(file)
+    assert read_json(file)["control_rate"] == [cell.told["rate"]] * 2
+    assert np.shape(read_simulated(file)["distance"]) == (16, 2)
 
 
 def test_what_does_not_matter_to_a_cell_is_not_told_it() -> None:

@@ -11,6 +11,7 @@ from commandline import pup
 from pup.errors import InputError
 from pup.files import sha256
 from pup.policy.bundle import CARD, NumpyPolicy
+from pup.recording import Recording
 from pup.robot import RobotDescription
 from services.rehearsal import read_walked, rehearsal_words, rehearse
 
@@ -32,8 +33,19 @@ def study(file: Path, *trials: Any, **more: Any) -> Path:
     return file
 
 
-def again(file: Path, out: Path) -> dict[str, Any]:
-    return rehearse(ROBOT, POLICY, ROBOT.identified_path, file, out, seed=0, threads=2)
+def again(file: Path, out: Path, rate: float | None = None) -> dict[str, Any]:
+    return rehearse(ROBOT, POLICY, ROBOT.identified_path, file, out, 0, threads=2, rate=rate)
+
+
+def recorded(folder: Path, name: str, ticks: Any) -> str:
+    """A recording of a walk where a laboratory leaves it, by how long its ticks took, s."""
+    time = np.concatenate([[0.0], np.cumsum(ticks)])
+    still = np.tile(ROBOT.limits[0], (len(time), 1))
+    kind = {"motion": "walk", "support": "ground", "source": "simulation"}
+    told = {"joints": ROBOT.joint_names, "time": time, "target": still, "position": still}
+    walk = Recording(name, "darwin_op2", **kind, **told)
+    walk.write(folder / "agent" / "recordings" / f"{name}.parquet")
+    return name
 
 
 def test_trials_are_gathered_by_eta(tmp_path: Path) -> None:
@@ -72,6 +84,27 @@ def test_a_simulator_foretells_its_own_walks(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "own" / "rehearsal.json").read_text()) == own
 
 
+def test_walks_are_made_again_at_the_rate_of_the_robot(tmp_path: Path) -> None:
+    """Of its recordings, where they are there; a tick that was late does not tell it."""
+    ticks = np.tile([0.031, 0.031, 0.031, 0.045], 5)
+    walks = [
+        trial(ETAS[0], 1.0, recording=recorded(tmp_path, "run_1_1", ticks)),
+        trial(ETAS[0], 1.0, recording=recorded(tmp_path, "run_2_1", ticks)),
+        trial(ETAS[1], 1.0, recording="run_3_1"),  # is gone
+    ]
+    file = study(tmp_path / "study.json", *walks)
+    assert again(file, tmp_path / "own")["control_rate"] == pytest.approx(1 / 0.031)
+    (tmp_path / "alone").mkdir()
+    alone = study(tmp_path / "alone" / "study.json", *walks)
+    fast = again(alone, tmp_path / "fast")
+    assert fast["control_rate"] == 33.0  # as an agent has it
+    slow = again(file, tmp_path / "slow", 25.0)
+    assert slow["control_rate"] == 25.0
+    assert slow["simulated_distance"] != fast["simulated_distance"]
+    with pytest.raises(InputError, match="trained for 25 to 33 Hz, not 50"):
+        again(file, tmp_path / "out", 50.0)
+
+
 @pytest.mark.parametrize(
     ("trials", "more", "said"),
     [
@@ -103,3 +136,10 @@ def test_the_command_says_it_in_a_sentence(tmp_path: Path) -> None:
     assert refused.code == 2 and "--policy" in refused.err
     refused = pup(*command, "--policy", POLICY, "--landscape", 4)
     assert refused.code == 2 and "--landscape" in refused.err
+    refused = pup(*command, "--policy", POLICY, "--rate", 50)
+    assert refused.code == 2 and "not 50" in refused.err
+    shown = ("replay", "--robot", "darwin_op2", "--policy", POLICY, "--out", tmp_path / "out")
+    refused = pup(*shown, "--rate", 30)
+    assert refused.code == 2 and "--rate" in refused.err
+    refused = pup(*shown, "--rate", 50, "--landscape", 4)
+    assert refused.code == 2 and "not 50" in refused.err

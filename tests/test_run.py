@@ -133,6 +133,8 @@ def check_result(told: dict[str, Any], out: Path) -> None:
     assert told["transfer"] == json.loads((out / "transfer" / "transfer.json").read_text())
     assert told["left_out"] == {"train": "as told", "diagnosis": "as told"}
     assert told["took"].keys() == {"presysid", "replay", "transfer", "rehearsal"}
+    rehearsed = json.loads((out / "rehearsal" / "rehearsal.json").read_text())
+    assert rehearsed["control_rate"] == pytest.approx(1 / 0.031)  # as the laboratory walks
     page = Page(out / "report.html")
     assert not {"script", "link", "iframe"} & {name for name, _ in page.elements}
     sources = [attributes["src"] for name, attributes in page.elements if name == "img"]

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from toy_task import EPISODE, ToyTask
+from toy_task import EPISODE, Step, ToyTask
 
 pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
@@ -31,8 +31,9 @@ from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
 from services import training
 from services.arguments import parser
+from services.failures import FailedError
 from services.training_options import Options, training_options
-from workers.learner import FragmentsToBatch, Learning, merged, prepared, shuffled
+from workers.learner import FragmentsToBatch, Learning, MirrorLearner, merged, prepared, shuffled
 from workers.module import PolicyModule, load
 from workers.ppo import Iteration, Setup, Trainer, learner_place
 from workers.rollouts import Sampler, Sampling, spaces
@@ -204,6 +205,38 @@ def test_a_toy_is_learnt(ray_here: None) -> None:
     assert told[-1].learnt["rate"] < 0.2 * told[0].learnt["rate"]
     assert told[-1].ended[:, 3].mean() < 0.05
     assert all(one.steps == 1024 and one.lost == 0 for one in told)
+    assert not any(one.stuck or one.learnt["skipped"] for one in told)
+
+
+class Spoilt(ToyTask):
+    """Pays what is no number."""
+
+    def step(self, action: np.ndarray) -> Step:
+        told = super().step(action)
+        return replace(told, reward=np.nan * told.reward)
+
+
+@pytest.mark.ray
+def test_steps_that_move_nothing_are_counted(ray_here: None) -> None:
+    """One of many, and all of an iteration, after which nothing is learnt any more."""
+
+    def spoil(learner: MirrorLearner) -> None:
+        fragment = Sampler(SAMPLING, 0).sample(learner.policy_module.policy)
+        told = prepared(learner.policy_module, fragment, LEARNING)
+        some = Samples(*(column[: LEARNING.minibatch] for column in told))
+        some.returns[0] = torch.nan
+        before = learner.vector.clone()
+        learner._step(some, LEARNING.weights)
+        assert torch.equal(learner.vector, before)
+
+    with closing(Trainer(TOY)) as trainer:
+        trainer.algorithm.learner_group.foreach_learner(spoil)
+        told = trainer.iterate()
+        assert (told.learnt["skipped"], told.stuck) == (1, False)
+        assert trainer.iterate().learnt["skipped"] == 0
+    with closing(Trainer(replace(TOY, sampling=replace(SAMPLING, make=Spoilt)))) as trainer:
+        told = trainer.iterate()
+    assert told.stuck and told.learnt["skipped"] >= LEARNING.epochs
 
 
 @pytest.mark.ray
@@ -379,13 +412,21 @@ def test_an_interrupted_job_ends_alike(
     assert (part["done"], part["steps"]) == (False, 64)
     halves = job(tmp_path / "halves")
     assert same(weights_of(tmp_path / "whole"), weights_of(tmp_path / "halves"))
-    for name in ("steps", "return", "reward", "kl", "value", "rate"):
+    for name in ("steps", "return", "reward", "kl", "value", "rate", "skipped"):
         assert halves["curve"][name] == whole["curve"][name]
     rows: list[object] = []
     assert job(tmp_path / "halves", told=lambda row, steps: rows.append(row))["done"]
     assert not rows  # there was nothing left to do
     with pytest.raises(InputError, match="another training"):
         job(tmp_path / "halves", replace(SMALL, seed=1))
+
+
+@pytest.mark.ray
+def test_a_job_that_learns_nothing_any_more_says_so(ray_here: None, tmp_path: Path) -> None:
+    hasty = replace(SMALL, learning=replace(SMALL.learning, rate=1e30))
+    with pytest.raises(FailedError, match=r"no gradient of iteration \d was finite.*lower"):
+        job(tmp_path, hasty)
+    assert not (tmp_path / "policy").exists()
 
 
 @pytest.mark.ray

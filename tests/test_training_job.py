@@ -9,6 +9,7 @@ import pytest
 from commandline import pup
 from jobs import Job
 
+from pup.files import read_json
 from services.gateway.artefacts import read as read_document
 from services.gateway.documents import TrainingDocument
 from services.transfer import read_simulated
@@ -47,6 +48,7 @@ def test_a_stopped_training_says_so_and_leaves_nothing_running(tmp_path: Path) -
     assert Path(shown["video"]).stat().st_size > 1000
     assert shown["drawn_by"] in ("mujoco", "matplotlib")
     simulated = read_simulated(tmp_path / "walk" / "simulated.json")
+    assert read_json(tmp_path / "walk" / "simulated.json")["control_rate"] == [33.0, 33.0]
     assert np.shape(simulated["eta"]) == (2, 3) and np.shape(simulated["distance"]) == (16, 2)
     eta = ",".join(map(str, (-0.5, *shown["fitted_eta"][1:])))
     conditioned = pup(*walk, "--out", tmp_path / "conditioned", "--eta", eta).json()

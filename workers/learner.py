@@ -195,7 +195,7 @@ class MirrorLearner(PPOTorchLearner):
         mirror = self.learning.mirror
         self.mirror = None if mirror is None else TorchMirror(mirror, self._device)
         self.logged: list[Losses] = []
-        self.iteration = 0
+        self.skipped = self.iteration = 0
 
     @property
     def policy_module(self) -> PolicyModule:
@@ -240,7 +240,7 @@ class MirrorLearner(PPOTorchLearner):
         return {}, {DEFAULT_MODULE_ID: self.logged[-1].total}, {}
 
     def _step(self, samples: Samples, weights: LossWeights) -> None:
-        """Descend by a minibatch; gradients that are no numbers move nothing."""
+        """Descend by a minibatch; gradients that are no numbers move nothing, and are counted."""
         given = self.policy_module.policy, samples, weights, self.mirror
         if self._device.type == "cpu":
             told, gradients = differentiated(*given)
@@ -252,6 +252,8 @@ class MirrorLearner(PPOTorchLearner):
         if torch.isfinite(norm):
             self.vector.grad = gradient.mul_((self.learning.gradient / norm).clamp(max=1.0))
             self.optimizer.step()
+        else:
+            self.skipped += 1
         self.logged.append(Losses(*(value.detach() for value in told)))
 
     def _weights_now(self) -> LossWeights:
@@ -279,7 +281,8 @@ class MirrorLearner(PPOTorchLearner):
         told["kl"] = float(torch.stack([one.kl for one in last]).mean())
         told["rate"] = self.optimizer.param_groups[0]["lr"]
         self.optimizer.param_groups[0]["lr"] = self._next_rate(told["rate"], told["kl"])
-        self.logged = []
+        told |= {"skipped": self.skipped, "moved": len(self.logged) - self.skipped}
+        self.logged, self.skipped = [], 0
         for name, value in told.items():
             self.metrics.log_value((DEFAULT_MODULE_ID, name), value, window=1)
 

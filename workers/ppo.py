@@ -2,6 +2,7 @@
 
 import logging
 import math
+import sys
 import tempfile
 import time
 import warnings
@@ -72,7 +73,8 @@ class Iteration:
       ended: see Fragment, of all runners.
       reward: mean of a live step.
       seconds: of waiting for samples and of learning.
-      learnt: means of the losses, the rate.
+      learnt: means of the losses, the rate, and steps that moved nothing (`skipped`).
+      stuck: whether all steps moved nothing.
       trouble: why runners were lost, where some were.
     """
 
@@ -83,6 +85,7 @@ class Iteration:
     seconds: tuple[float, float]
     learnt: dict[str, float]
     trouble: str = ""
+    stuck: bool = False
 
 
 class BatchPPO(PPO):
@@ -128,14 +131,16 @@ class BatchPPO(PPO):
         self.metrics.aggregate(results, key="learners")
         steps = sum(map(len, fragments))
         live = sum(int(f.live.sum()) for f in fragments)
+        learnt = _numbers(results[0][DEFAULT_MODULE_ID])
         self.told = Iteration(
             steps=steps,
             lost=self._expected() - steps,
             ended=np.concatenate([f.ended for f in fragments]),
             reward=float(sum(f.reward.sum(dtype=np.float64) for f in fragments) / live),
             seconds=(sampled - begin, time.perf_counter() - sampled),
-            learnt=_numbers(results[0][DEFAULT_MODULE_ID]),
+            learnt=learnt,
             trouble=trouble,
+            stuck=learnt.pop("moved") == 0,
         )
 
     def coming(self) -> list[Fragment]:
@@ -187,7 +192,8 @@ class BatchPPO(PPO):
 
 def _numbers(told: dict[str, Any]) -> dict[str, float]:
     """What our learner logged, out of RLlib's statistics."""
-    return {name: float(told[name].peek()) for name in (*Losses._fields, "rate")}
+    names = (*Losses._fields, "rate", "skipped", "moved")
+    return {name: float(told[name].peek()) for name in names}
 
 
 def learner_place(minibatch: int, here: bool, anywhere: bool, shared: bool) -> tuple[int, int]:
@@ -196,7 +202,7 @@ def learner_place(minibatch: int, here: bool, anywhere: bool, shared: bool) -> t
     Args:
       minibatch: samples of a step.
       here: whether this process sees a GPU.
-      anywhere: whether the cluster has one.
+      anywhere: whether the cluster has a free one: Ray waits for ever for one that others have.
       shared: whether this process samples on several cores: a learner beside it would wait for
         Python's lock, and the samples for the learner.
     """
@@ -217,9 +223,13 @@ def _start(setup: Setup) -> BatchPPO:
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     seen, done = spaces(setup.shape.proprioception, setup.shape.joints, setup.shape.bins)
     here = torch.cuda.is_available()
-    anywhere = ray.cluster_resources().get("GPU", 0) > 0
     shared = setup.runners == 0 and setup.sampling.threads > 1
-    remote, gpus = learner_place(setup.learning.minibatch, here, anywhere, shared)
+    minibatch = setup.learning.minibatch
+    free = ray.available_resources().get("GPU", 0) >= 1
+    remote, gpus = learner_place(minibatch, here, free, shared)
+    if minibatch >= GPU_MINIBATCH and not gpus and ray.cluster_resources().get("GPU", 0):
+        line = "others have the cluster's GPUs: the learner takes a processor; stop and repeat the "
+        print(line + "command for a GPU once one is free", file=sys.stderr, flush=True)
     config = (
         PPOConfig(algo_class=BatchPPO)
         .environment(

@@ -102,9 +102,15 @@ class TaskSettings:
             work_weight=walk.work,
         )
 
-    def evaluation(self) -> "TaskSettings":
-        """The same task to its end or a fall, with the policy told the true parameters."""
-        return replace(self, parameter_noise=0.0, on_course=False)
+    def evaluation(self, rate: float | None = None) -> "TaskSettings":
+        """The same task to its end or a fall, with the policy told the true parameters.
+
+        Args:
+          rate: of control, Hz, where one robot is meant, whose agent keeps one; None draws it, as
+            a training does.
+        """
+        rates = self.control_rate if rate is None else (rate, rate)
+        return replace(self, parameter_noise=0.0, on_course=False, control_rate=rates)
 
     def without_noise(self) -> "TaskSettings":
         """The same task with exact readings, one start, and the mean control rate."""

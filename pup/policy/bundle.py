@@ -84,6 +84,19 @@ class PolicyCard:
         """The unit scale of its parameters."""
         return UnitScale(np.array(self.parameter_lower), np.array(self.parameter_upper))
 
+    def check_rate(self, rate: float) -> None:
+        """Refuse a control rate that it was not trained for, but for what rounding makes of one.
+
+        Args:
+          rate: Hz.
+
+        Raises:
+          InputError: the message says for which it was.
+        """
+        low, high = self.rates
+        if not low * 0.99 <= rate <= high * 1.01:
+            raise InputError(f"the policy was trained for {low:g} to {high:g} Hz, not {rate:g}")
+
     def document(self) -> dict[str, Any]:
         """The card as JSON values."""
         told = {f.name: getattr(self, f.name) for f in fields(self)}

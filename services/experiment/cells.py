@@ -233,10 +233,13 @@ class _Graph:
         return found[0] if found else None
 
     def _trials(self, walk: Walk, method: Method) -> None:
+        from services.laboratory import period_of
+
         policy, trials = f"policy-{walk.direction}-{method}", self.plan.trials
         landscape = f"landscape-{walk.direction}-{method}"
         if method in SEARCHED:
-            told = self._told(etas=trials.landscape, horizon=trials.horizon)
+            rate = 1 / period_of(self.robot)  # of all walks; distances hang on it
+            told = self._told(etas=trials.landscape, horizon=trials.horizon, rate=rate)
             needs = {"policy": policy, "bounds": FLEET}
             self._add(Cell(landscape, "landscape", needs, told, self._given(), 60.0))
         for seed in self._seeds(walk):

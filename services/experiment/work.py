@@ -192,7 +192,7 @@ def landscape(task: Task) -> dict[str, Any]:
     robot, told, file = task.robot, task.told, task.out / "simulated.json"
     walker = NumpyPolicy.load(task.needed["policy"] / "policy", robot)
     bounds = read_bounds(task.needed["bounds"] / "bounds.json", robot)
-    settings = TaskSettings.of(robot, Direction(walker.card.direction)).evaluation()
+    settings = TaskSettings.of(robot, Direction(walker.card.direction)).evaluation(told["rate"])
     settings = replace(settings, horizon=told["horizon"])
     write_landscape(file, robot, walker, bounds, settings, told["etas"], told["seed"], 1)
     return {"simulated": sha256(file)}
