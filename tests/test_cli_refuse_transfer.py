@@ -138,6 +138,15 @@ def _(place: Place) -> Made:
     )
 
 
+@case("a database in a folder that is not there")
+def _(place: Place) -> Made:
+    file = place.here / "none" / "gateway.db"
+    return serve(place, f'data = "service"\ndatabase = "sqlite:///{file}"\nlog = "error"'), (
+        "database",
+        "unable to open",
+    )
+
+
 @case("a token without a name")
 def _(place: Place) -> Made:
     return serve(place, 'data = "service"', "token"), ("token", "NAME")

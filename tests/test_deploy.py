@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import subprocess
 import tomllib
 from importlib.metadata import version
 from pathlib import Path
@@ -37,7 +38,7 @@ from services.gateway.dispatcher import Dispatcher
 from services.gateway.fits import Fits
 from services.gateway.keys import Tokens
 from services.gateway.metrics import Metrics
-from services.gateway.store import Store
+from services.gateway.store import TRY, Store
 
 IMAGE = re.compile(rf"pup-(gateway|cluster|agent):{re.escape(version('pup'))}(-cuda)?")
 USER = 1000
@@ -238,6 +239,7 @@ def test_probes_ask_what_the_gateway_answers() -> None:
     ):
         assert container[probe]["httpGet"] == {"path": path, "port": "http"}
         assert path in paths
+    assert container["readinessProbe"]["timeoutSeconds"] > TRY
     monitor = one(overlay("cluster"), "ServiceMonitor")["spec"]
     assert {e["path"] for e in monitor["endpoints"]} <= paths
     service = one(overlay("cluster"), "Service", "gateway")
@@ -301,6 +303,12 @@ def test_no_secret_is_in_the_repository() -> None:
         ignored = (folder / ".gitignore").read_text().split()
         assert ignored[0] == "*"
         assert set(ignored[1:]) <= {"!.gitignore", "!kustomization.yaml"}
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no checkout of git")
+@pytest.mark.parametrize("file", ["deploy/secrets/keys/darwin-1.key_secret", "keys/a.key_secret"])
+def test_git_ignores_the_keys_of_robots(file: str) -> None:
+    assert subprocess.run(["git", "-C", ROOT, "check-ignore", "-q", file]).returncode == 0
 
 
 @pytest.mark.parametrize("name", OVERLAYS)

@@ -97,6 +97,18 @@ def test_all_is_denied_by_default(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OVERLAYS)
+def test_services_lead_to_a_gateway_that_is_not_ready(name: str) -> None:
+    """Its database may be away: pages and the emergency stop need none."""
+    for service in ("gateway", "gateway-link"):
+        assert one(overlay(name), "Service", service)["spec"]["publishNotReadyAddresses"] is True
+
+
+@pytest.mark.parametrize("name", OVERLAYS)
+def test_addresses_of_robots_are_not_rewritten_before_the_policies_see_them(name: str) -> None:
+    assert one(overlay(name), "Service", "gateway-link")["spec"]["externalTrafficPolicy"] == "Local"
+
+
+@pytest.mark.parametrize("name", OVERLAYS)
 def test_what_is_needed_is_let_through(name: str) -> None:
     there = ends(name)
     gateway, head, worker = there["gateway"], there["head"], there["worker"]

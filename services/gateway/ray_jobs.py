@@ -4,7 +4,7 @@ The gateway names each submission itself, so that asking twice is asking once.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,16 @@ class RayJobs:
 
     Args:
       url: of its dashboard, such as `http://ray-head:8265`.
-      token: of token authentication; empty for none.
+      token_file: with the token of its authentication; empty for what Ray itself reads.
+
+    Raises:
+      InputError: the address is none, or the file cannot be read.
     """
 
-    def __init__(self, url: str, token: str) -> None:
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
+    def __init__(self, url: str, token_file: str) -> None:
+        token_of(token_file)  # told at the start, and not by jobs that wait
         try:
-            self.http = httpx.AsyncClient(base_url=url, headers=headers, timeout=TIMEOUT)
+            self.http = httpx.AsyncClient(base_url=url, auth=_Token(token_file), timeout=TIMEOUT)
         except (httpx.InvalidURL, ValueError) as error:
             raise InputError(f"ray: {url[:60]!r} is no address ({error})") from error
 
@@ -103,9 +106,23 @@ class RayJobs:
             answer = await self.http.request(method, path, **options)
         except httpx.HTTPError as error:
             raise RayAwayError(f"does not answer ({error or type(error).__name__})") from error
+        except InputError as error:  # the token's file is being changed, say
+            raise RayAwayError(f"cannot be asked ({error})") from error
         if answer.status_code in (401, 403):
             raise RayAwayError(f"refuses the gateway's token ({answer.status_code})")
         return answer
+
+
+class _Token(httpx.Auth):
+    """Ray's token, read again for each request: it is changed while the gateway runs."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+
+    def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:
+        if token := token_of(self.file):
+            request.headers["Authorization"] = f"Bearer {token}"
+        yield request
 
 
 def token_of(file: str, environment: Mapping[str, str] = os.environ) -> str:

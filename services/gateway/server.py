@@ -22,7 +22,7 @@ from services.gateway.fits import Fits
 from services.gateway.keys import KeyRing, Tokens
 from services.gateway.link import Link
 from services.gateway.metrics import Metrics
-from services.gateway.ray_jobs import RayJobs, token_of
+from services.gateway.ray_jobs import RayJobs
 from services.gateway.recordings import Shelves
 from services.gateway.store import ReplacedError, Store
 
@@ -55,6 +55,7 @@ def serve(config: Config) -> dict[str, Any]:
 
     Raises:
       InputError: a setting, a file or an address cannot be used.
+      FailedError: the database does not answer now.
     """
     _check_certificate(config)
     handler = logging.StreamHandler(sys.stderr)
@@ -84,7 +85,7 @@ def _check_certificate(config: Config) -> None:
 
 
 async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
-    ray = RayJobs(config.ray, token_of(config.ray_token)) if config.ray else None
+    ray = RayJobs(config.ray, config.ray_token) if config.ray else None
     store, fits, metrics = Store(config.url), Fits(), Metrics()
     conductor = Conductor(store, fits, metrics)
     dispatcher = Dispatcher(

@@ -6,6 +6,7 @@ gateway takes a new epoch; a gateway that finds a newer one was replaced and may
 
 import asyncio
 import math
+import sqlite3
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,11 +18,12 @@ import sqlalchemy as sa
 from alembic import command
 from alembic.config import Config as Migrations
 from alembic.util import CommandError
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import OperationalError, SQLAlchemyError
 
 from pup.errors import InputError
 from pup.transfer.study import Study
 from pup.transfer.trial import Trial
+from services.failures import FailedError
 from services.gateway.jobs import Job
 from services.gateway.records import Row, job_of, job_row, study_of, study_row, trial_row
 
@@ -29,6 +31,20 @@ T = TypeVar("T")
 ANSWERS_KEPT = 7 * 86400.0  # s
 TRIED = 1.0
 """Between two tries whether the database takes writes, s: anybody may ask."""
+TRY = 2.0
+"""For such a try, s: less than a probe waits, so that it hears why."""
+LIBPQ = ("psycopg", "psycopg2")
+WAITS = {
+    "connect_timeout": 5,  # s
+    "keepalives_idle": 10,  # s
+    "keepalives_interval": 5,  # s
+    "keepalives_count": 3,
+    "tcp_user_timeout": 15_000,  # ms
+    "options": "-c statement_timeout=10000",  # ms
+}
+"""For PostgreSQL: one that vanished would hold the store's only thread for a quarter of an hour."""
+PASSING = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL)
+"""Of SQLite's errors those that may pass; a file that cannot be opened is a mistake."""
 
 
 class ReplacedError(RuntimeError):
@@ -81,13 +97,14 @@ class Store:
 
     Raises:
       InputError: it cannot be opened, or a newer program wrote it.
+      FailedError: it does not answer now, and may later.
     """
 
     def __init__(self, url: str) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="store")
         self._tried = (-math.inf, False)
         try:
-            self.engine = sa.create_engine(url)
+            self.engine = sa.create_engine(url, **engine_options(url))
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _pragmas)
                 sa.event.listen(self.engine, "begin", lambda c: c.exec_driver_sql("BEGIN"))
@@ -101,6 +118,8 @@ class Store:
             raise InputError(f"database: a newer program wrote it ({error})") from error
         except (SQLAlchemyError, ModuleNotFoundError) as error:
             place = str(error).splitlines()[0]
+            if isinstance(error, OperationalError) and _may_pass(error):
+                raise FailedError(f"database: does not answer now ({place})") from error
             raise InputError(f"database: cannot be opened ({place})") from error
 
     async def run(self, act: Callable[[sa.Connection], T]) -> T:
@@ -177,13 +196,16 @@ class Store:
         await self.run(keep)
 
     async def writable(self) -> bool:
-        """Whether the database takes writes of this gateway; tried once a second at most."""
+        """Whether the database takes writes of this gateway; tried once a second at most.
+
+        A try that is given up leaves the thread when the database lets go of it.
+        """
         at, told = self._tried
         if time.monotonic() - at > TRIED:
             try:
-                await self.run(self._check)
+                await asyncio.wait_for(self.run(self._check), TRY)
                 told = True
-            except (SQLAlchemyError, ReplacedError):
+            except (SQLAlchemyError, ReplacedError, TimeoutError):
                 told = False
             self._tried = time.monotonic(), told
         return told
@@ -259,6 +281,24 @@ class Store:
         return [
             (study_of(dict(row._mapping), trials.get(row.name, [])), row.simulated) for row in rows
         ]
+
+
+def engine_options(url: str) -> dict[str, Any]:
+    """Of SQLAlchemy's engine: no call waits long for a PostgreSQL that vanished.
+
+    What the URL itself tells of a connection is left as it is.
+    """
+    place = sa.make_url(url)
+    if place.get_backend_name() != "postgresql" or place.get_driver_name() not in LIBPQ:
+        return {}
+    waits = {name: value for name, value in WAITS.items() if name not in place.query}
+    return {"pool_pre_ping": True, "connect_args": waits}
+
+
+def _may_pass(error: OperationalError) -> bool:
+    """Whether trying again may help: a server may be late, a wrong path stays wrong."""
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    return code is None or code & 0xFF in PASSING  # the low byte of an extended code is its kind
 
 
 def _pragmas(connection: Any, _: Any) -> None:

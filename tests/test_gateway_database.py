@@ -1,0 +1,70 @@
+"""A database that is late, locked or gone: what the gateway says, and how soon."""
+
+import asyncio
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("fastapi")
+pytest.importorskip("botorch")
+
+from commandline import pup
+
+from services.gateway.store import TRIED, TRY, WAITS, Store, engine_options
+
+SERVER = "postgresql+psycopg://pup:secret@db/pup"
+
+
+def locked(file: Path) -> sqlite3.Connection:
+    """A connection that lets nobody else write, nor read."""
+    held = sqlite3.connect(file, isolation_level=None)
+    held.execute("BEGIN EXCLUSIVE")
+    return held
+
+
+def test_a_locked_database_is_told_before_a_probe_gives_up(tmp_path: Path) -> None:
+    async def live() -> None:
+        store = Store(f"sqlite:///{tmp_path / 'gateway.db'}")
+        with closing(locked(tmp_path / "gateway.db")):
+            began = time.monotonic()
+            assert not await store.writable()
+            assert time.monotonic() - began < TRY + 0.5
+        await asyncio.sleep(TRIED + 0.1)
+        assert await store.writable()
+        store.close()
+
+    asyncio.run(live())
+
+
+def test_a_database_that_does_not_answer_yet_is_no_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Code 1: systemd starts the gateway again."""
+    file = tmp_path / "gateway.db"
+    monkeypatch.setenv("PUP_DATA", str(tmp_path))
+    monkeypatch.setenv("PUP_DATABASE", f"sqlite:///{file}?timeout=0.1")
+    monkeypatch.setenv("PUP_LOG", "error")
+    with closing(locked(file)):
+        done = pup("serve")
+    assert done.code == 1
+    assert done.err.splitlines()[-1].startswith("pup serve: database: does not answer now (")
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:////x/y.db", "mysql://db/pup"])
+def test_other_databases_are_opened_as_they_are(url: str) -> None:
+    assert engine_options(url) == {}
+
+
+@pytest.mark.parametrize("url", [SERVER, SERVER.replace("+psycopg", "")])
+def test_no_call_waits_long_for_postgresql(url: str) -> None:
+    assert engine_options(url) == {"pool_pre_ping": True, "connect_args": WAITS}
+
+
+def test_what_the_url_tells_of_a_connection_stands() -> None:
+    url = f"{SERVER}?options=-csearch_path%3Dlab&connect_timeout=60"
+    told = engine_options(url)["connect_args"]
+    assert set(WAITS) - set(told) == {"options", "connect_timeout"}
