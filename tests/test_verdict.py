@@ -18,8 +18,8 @@ from pup.diagnosis.verdict import (
     in_order,
     left_over,
     of_other_form,
-    shared,
     probabilities,
+    shared,
     twins_of,
 )
 from pup.physics.terms import TERMS, Place
