@@ -29,14 +29,12 @@ class Named:
       place: as in the document.
       probability: of it.
       finding: index of the finding it belongs to.
-      outside: whether it is told to be outside the list, by name or by a law.
     """
 
     effect: str
     place: Mapping[str, Any]
     probability: float
     finding: int
-    outside: bool
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,6 @@ def ranking(findings: Sequence[Mapping[str, Any]]) -> list[Named]:
                 e["place"],
                 float(e["probability"]),
                 index,
-                e["effect"] == UNKNOWN or bool(e.get("law")),
             )
             for e in (finding, *finding.get("equivalents", []))
         ]
@@ -170,7 +167,9 @@ def judge(
         "size": len(group) or None,
         "sharp": _sharp(document.get("findings", [])),
         "allowed": verdict in truth["answer"]["verdicts"] or stood["immaterial"],
-        "unknown": any(n.outside and (n is named[0] or n.probability >= STATED) for n in named),
+        "unknown": any(
+            n.effect == UNKNOWN and (n is named[0] or n.probability >= STATED) for n in named
+        ),
         "confidence": _confidence(named),
         "background": bool(background),
         "ambiguous": verdict == "undetermined" or len(group) > 1,
