@@ -156,10 +156,7 @@ def angles(turn: Array, android: bool) -> Array:
       turn: from the chip to the world, a quaternion.
       android: whether the unit register says Android, not Windows.
     """
-    w, x, y, z = turn
-    about_z = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    about_y = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    about_x = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    about_x, about_y, about_z = _turns(turn)
     pitch = -about_x if android else about_x
     return np.array([-about_z % (2 * np.pi), -about_y, pitch])
 
@@ -171,9 +168,18 @@ def lean(turn: Array) -> tuple[float, float]:
       turn: from the torso to the world, a quaternion.
     """
     told = multiply(np.rint(multiply(turn, LYING) * UNIT), conjugate(LYING))
-    w, x, y, z = told / np.linalg.norm(told)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return float(roll), float(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)))
+    roll, pitch, _ = _turns(told / np.linalg.norm(told))
+    return roll, pitch
+
+
+def _turns(turn: Array) -> tuple[float, float, float]:
+    """Turns about x, y and z (Z-Y-X Euler angles) of a quaternion, rad."""
+    w, x, y, z = turn
+    return (
+        float(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+        float(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))),
+        float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
+    )
 
 
 def _lying(vector: Array) -> Array:
