@@ -11,6 +11,7 @@ from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
+from pup.physics.terms import TERMS
 
 Array = NDArray[np.float64]
 Tried = tuple[tuple[Hypothesis, ...], Fit]
@@ -23,9 +24,6 @@ LAST = 14
 """Steps of a finalist's fit to its end."""
 SHARES = (1.0, 0.4)
 """Shares of its linear size at which a finalist may start."""
-BESIDES = {"joint_stop": (1.0, 5.0, 25.0)}
-"""Sizes that a finalist may start at besides, in typical ones: what bounces has a minimum at many a
-stiffness, and slopes lead to the softest."""
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
 PUZZLING, GLARING = 0.5, 30.0
@@ -72,7 +70,7 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
     normal[np.diag_indices_from(normal)] += 1 + DAMPED * np.diag(normal)
     low, high = ([getattr(c, end) for c in before.coordinates] for end in ("lower", "upper"))
     upper = [c.upper for c in fit.coordinates[n : n + len(sizes)]]
-    besides = BESIDES.get(score.trace.hypothesis.effect, ())
+    besides = TERMS[score.trace.hypothesis.effect].starts
     starts = [(share * sizes, share * sizes) for share in SHARES]
     starts += [(np.minimum(np.full(len(sizes), size), upper), sizes) for size in besides]
     places = []

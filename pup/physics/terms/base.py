@@ -183,6 +183,8 @@ class Term:
         model's bodies, the feet and the floor, or one for all.
       constant: whether it is a number that the robot has, as a mass or a delay, and not a law whose
         real form may be another.
+      starts: sizes, in typical ones, from which a fit may find others of its minima than from
+        where slopes lead: what bounces has one at many a stiffness.
       needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
@@ -198,6 +200,7 @@ class Term:
     source: ClassVar[str]
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
     constant: ClassVar[bool] = False
+    starts: ClassVar[tuple[float, ...]] = ()
     needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 
