@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pup.diagnosis.doubts import doubt, left_outside, left_over
 from pup.diagnosis.evidence import Score, Trace
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
@@ -14,9 +15,7 @@ from pup.diagnosis.verdict import (
     OTHER_FORM,
     Finding,
     Parameter,
-    doubt,
     in_order,
-    left_over,
     of_other_form,
     probabilities,
     shared,
@@ -65,6 +64,19 @@ def test_a_model_of_some_recordings_leaves_what_it_leaves_of_those() -> None:
     assert left_over(left(some, 1.0), noise) == 0
     beyond = left_over(left(some, 2.0), noise)
     assert beyond == pytest.approx(2.9 * len(some.values), rel=0.1)
+
+
+def test_what_is_lost_on_motions_left_out_is_left_besides() -> None:
+    """A ripple that follows the motions it was fitted to is no name for what it cannot foretell."""
+    noise = Noise(np.full(3, 0.002), np.zeros(3), "repeats")
+    model = left(MEASURED, 1.0)
+    unit = np.random.default_rng(1).normal(size=len(MEASURED.values)) * 0.002
+    foretold = replace(model, predicted=MEASURED.values + unit)
+    astray = replace(model, predicted=MEASURED.values + 3 * unit)
+    assert left_outside(foretold, noise) == left_over(model, noise) == 0
+    assert left_outside(astray, noise) == pytest.approx(7.9 * len(MEASURED.values), rel=0.2)
+    worse = replace(foretold, fit=left(MEASURED, 2.0).fit)
+    assert left_outside(worse, noise) == left_over(worse, noise) > 0  # never less than in sample
 
 
 def rival(effect: str, error: float, held_out: float = 0.0) -> Model:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.doubts import UNKNOWN, doubt, left_outside, left_over, unexplained_errors
 from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.impulses import BUDGET, responses
 from pup.diagnosis.lacks import Lack, lack_of_fit
@@ -21,15 +22,7 @@ from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.selection import KEPT, Selector
 from pup.diagnosis.starts import closely
-from pup.diagnosis.verdict import (
-    UNKNOWN,
-    Finding,
-    Parameter,
-    doubt,
-    left_over,
-    reaches,
-    unexplained_errors,
-)
+from pup.diagnosis.verdict import Finding, Parameter, reaches
 from pup.physics.terms import Place
 from pup.physics.terms.learned import LearnedLaw, unit
 from pup.robot import TermSpec
@@ -138,8 +131,9 @@ def _probability(model: Model, selector: Selector) -> float:
     """That there is something without a name: sure alone, else by what named effects leave."""
     if not model.hypotheses:
         return 1 - UNKNOWN
-    explained = selector.nominal.fit.chi2 - model.fit.chi2
-    return doubt(explained, left_over(model, selector.noise))
+    all_of_it = left_outside(selector.nominal, selector.noise)
+    left = left_outside(model, selector.noise)
+    return doubt(all_of_it - left, left)
 
 
 def _flagged(lacks: Sequence[Lack], missing: MissingInput) -> list[Lack]:

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.doubts import doubt, left_over
 from pup.diagnosis.evidence import overlap
 from pup.diagnosis.folds import apart, scatter
 from pup.diagnosis.hypotheses import Hypothesis
@@ -24,8 +25,6 @@ Answer = Literal["mismatch", "none", "undetermined"]
 
 TEMPERATURE = 4.0
 """Differences of worth are divided by this: models of real data are never quite right."""
-UNKNOWN = 0.03
-"""Probability that a cause outside the library looks like the best inside, and fits as well."""
 BLUR = 0.5
 """Difference of worth, in what is left, at which rivals count as equals but for a factor of e."""
 OWN_FORM, FORM = 0.2, 0.03
@@ -34,10 +33,6 @@ the share of what the best of them explains that another one may leave and be as
 OTHER_FORM = 0.13
 """Share of a law's magnitude by which a real one, of another form, differs from what is fitted: of
 33 in sealed sets nine of ten were nearer (docs/results/diagnosis.md)."""
-DOUBT = 0.2
-"""Where this share of what is to be explained is left, a name is as likely wrong as right."""
-SURE = 1.645
-"""Standard deviations of the noise floor that a model may leave beyond it."""
 SLIGHT = 0.25
 """Share of its typical size below which an effect is what every robot has a little of."""
 DOMINANT = 30.0
@@ -139,31 +134,6 @@ def probabilities(models: Sequence[Model], before: Model, noise: Noise) -> Array
     shared = OWN_FORM * weights[siblings].sum() * alike / alike.sum()
     weights = np.where(siblings, (1 - OWN_FORM) * weights, weights) + shared
     return np.asarray(weights / weights.sum())
-
-
-def left_over(model: Model, noise: Noise) -> float:
-    """Chi-squared that a model leaves beyond noise, however large that may be at each channel."""
-    usual = 1 + SURE * noise.unsure
-    beyond = np.bincount(model.measured.channel, unexplained_errors(model) ** 2 - usual)
-    return float(np.maximum(beyond, 0.0).sum())
-
-
-def unexplained_errors(model: Model) -> Array:
-    """Errors of a model in units of its noise, that of a delay's jitter included, (n_samples,)."""
-    assert model.fit.residual is not None
-    uneven = jitter(model)
-    return model.fit.residual if uneven is None else uneven.residual
-
-
-def doubt(explained: float, left: float) -> float:
-    """Probability that what is explained has another cause, by what is left.
-
-    Args:
-      explained: chi-squared.
-      left: chi-squared beyond noise.
-    """
-    share = left / (left + max(explained, 1e-9))
-    return UNKNOWN + (1 - UNKNOWN) * share / (share + DOUBT)
 
 
 def findings(

@@ -1,0 +1,60 @@
+"""How sure a name may be, by what the model that it is in leaves of the data."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pup.diagnosis.jitter import jitter
+from pup.diagnosis.models import Model
+from pup.diagnosis.residuals import Noise
+
+Array = NDArray[np.float64]
+
+UNKNOWN = 0.03
+"""Probability that a cause outside the library looks like the best inside, and fits as well."""
+DOUBT = 0.2
+"""Where this share of what is to be explained is left, a name is as likely wrong as right."""
+SURE = 1.645
+"""Standard deviations of the noise floor that a model may leave beyond it."""
+
+
+def doubt(explained: float, left: float) -> float:
+    """Probability that what is explained has another cause, by what is left.
+
+    Args:
+      explained: chi-squared.
+      left: chi-squared beyond noise.
+    """
+    share = left / (left + max(explained, 1e-9))
+    return UNKNOWN + (1 - UNKNOWN) * share / (share + DOUBT)
+
+
+def left_over(model: Model, noise: Noise) -> float:
+    """Chi-squared that a model leaves beyond noise, however large that may be at each channel."""
+    return _beyond(model, unexplained_errors(model), noise)
+
+
+def left_outside(model: Model, noise: Noise) -> float:
+    """The same on motions that were left out: what it leaves anyway, and what it loses on these.
+
+    What makes up for a cause that is not in the library may follow the motions that it was fitted
+    to closely, and others hardly.
+    """
+    assert model.fit.residual is not None
+    measured = model.measured
+    errors = measured.whiten((measured.values - model.predicted)[None], noise)[0]
+    lost = _beyond(model, errors, noise) - _beyond(model, model.fit.residual, noise)
+    return left_over(model, noise) + max(lost, 0.0)
+
+
+def unexplained_errors(model: Model) -> Array:
+    """Errors of a model in units of its noise, that of a delay's jitter included, (n_samples,)."""
+    assert model.fit.residual is not None
+    uneven = jitter(model)
+    return model.fit.residual if uneven is None else uneven.residual
+
+
+def _beyond(model: Model, errors: Array, noise: Noise) -> float:
+    """The part of some whitened errors' squares that is more than noise, over all channels."""
+    usual = 1 + SURE * noise.unsure
+    beyond = np.bincount(model.measured.channel, errors**2 - usual)
+    return float(np.maximum(beyond, 0.0).sum())
