@@ -37,7 +37,7 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
             f"recording {recording.id!r}: {start:g} to {stop:g} s holds {kept.sum()} rows; "
             f"it lasts {since[-1]:g} s"
         )
-    part = _rows(_with_commands(recording), kept)
+    part = _rows(with_commands(recording), kept)
     return replace(
         part,
         id=id or f"{recording.id}_{start:g}s",
@@ -64,7 +64,7 @@ def _rows(recording: Recording, kept: NDArray[np.bool_]) -> Recording:
     )
 
 
-def _with_commands(recording: Recording) -> Recording:
+def with_commands(recording: Recording) -> Recording:
     """The recording with the commands that each row holds; before the first one there is none."""
     extras = dict(recording.extras)
     if "torque_enabled" in extras:

@@ -175,7 +175,7 @@ class TestNoise:
 
     def test_a_start_is_averaged_over_its_rest(self) -> None:
         run = recordings({}, noise=0.003)[0]
-        steadied = steady_start(run)
+        steadied = steady_start(run, 0.012)
         rest = int(np.flatnonzero(run.target[:, 0] != run.target[0, 0])[0])
         assert steadied.position[0, 0] == pytest.approx(run.position[:rest, 0].mean())
         assert np.array_equal(steadied.position[1:], run.position[1:])

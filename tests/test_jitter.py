@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.coordinates import term_coordinate
+from pup.diagnosis.doubts import unexplained_errors
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.lacks import repeated
 from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.verdict import unexplained_errors
 from tests.diagnosis_cases import BENCH, recordings
 
 MEASURED = Measured.of(BENCH, recordings({}))

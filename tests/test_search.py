@@ -59,6 +59,17 @@ class TestPieces:
             resting = np.ptp(part.target[part.time[-1] - part.time < STILL])
             assert resting == 0
 
+    @pytest.mark.parametrize("step", [0.0, 0.0015])
+    def test_a_joint_that_is_held_still_does_not_hinder_it(self, step: float) -> None:
+        """Its readings flicker all the time, and by a step where its encoder is coarse."""
+        whole = moves([1.5] * 4)
+        rng = np.random.default_rng(0)
+        both = [np.hstack([v, np.zeros_like(v)]) for v in (whole.target, whole.position)]
+        read = both[1] + 0.0008 * rng.normal(size=both[1].shape)
+        read = np.round(read / step) * step if step else read
+        two = replace(whole, joints=("a", "b"), target=both[0], position=read)
+        assert len(pieces([two])) == 4
+
     def test_what_never_rests_or_is_short_stays_whole(self) -> None:
         (short,) = pieces([moves([1.5])])
         assert short.id == "long"

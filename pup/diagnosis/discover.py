@@ -25,7 +25,7 @@ from pup.diagnosis.starts import closely
 from pup.diagnosis.verdict import Finding, Parameter, reaches
 from pup.physics.terms import Place
 from pup.physics.terms.learned import LearnedLaw, unit
-from pup.robot import TermSpec
+from pup.robot import RobotDescription, TermSpec
 
 Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def unexplained(
         return None
     place, joints = _place(measured, missing, flagged)
     tried: list[Law] = []
-    if joints:
+    if joints and not _has_law(measured.robot, place):
         tried = laws(answers, fit, replays, replays([fit.row()])[0], joints)
     kept = _kept(tried, place, model, selector)
     law, corrected = kept[0] if kept else (None, model)
@@ -246,6 +246,12 @@ def _parameters(law: Law, place: Place, model: Model) -> dict[str, Parameter]:
             coordinate.value(at), unit(feature), *(coordinate.value(e) for e in ends)
         )
     return told
+
+
+def _has_law(robot: RobotDescription, place: Place) -> bool:
+    """Whether a robot's description has a law at a place already: two cannot stand there."""
+    laws_there = (t for t in robot.terms if t.effect == LearnedLaw.effect)
+    return any((t.kind, t.name) == (place.kind, place.name) for t in laws_there)
 
 
 def _term(law: Law, place: Place) -> TermSpec:

@@ -17,6 +17,7 @@ from pup.diagnosis.experiment import (
     rivals_of,
 )
 from pup.diagnosis.fitting import Fit, complete, differentiate, fit_together
+from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
@@ -67,6 +68,7 @@ class Diagnosis:
       ask: what to record next; None where nothing is open, or nothing would settle it.
       missing: the torques that the nominal model lacks; None where nothing is to be explained.
       unexplained: what the known effects leave; None where that is noise.
+      slight: effects that were found and do not matter.
       splits: how the nominal model's parameters differ between halves of the data, and how those
         of the model with what was found.
     """
@@ -88,6 +90,7 @@ class Diagnosis:
     ask: NextRecording | None = None
     missing: MissingInput | None = None
     unexplained: Unexplained | None = None
+    slight: tuple[Hypothesis, ...] = ()
     splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
 
     @property
@@ -169,13 +172,13 @@ def diagnose(
     left = unexplained(model, selector, seen)
     final = selector.predicting(left.model if left else model)
     shown = held_out(measured, selector.nominal, final, seed)
-    slight = ""
+    slight, evidence = "", dict[str, Any]()
     if not _matters(selector.nominal, model, left, shown, nominal.noise):
-        slight = little(model, shown)
+        slight, evidence["slight"] = little(model, shown), model.hypotheses
         left, model = None, selector.nominal
         final = model
         shown = held_out(measured, model, model, seed)
-    evidence: dict[str, Any] = {
+    evidence |= {
         "found": done.found,
         "enough": done.enough,
         "rounds": tuple(rounds),

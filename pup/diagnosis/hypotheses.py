@@ -111,12 +111,14 @@ SEVERAL = frozenset(("scan_delay",))
 
 
 def hypotheses(measured: Measured) -> list[Hypothesis]:
-    """All hypotheses about some measurements."""
+    """All hypotheses about some measurements, but for what the robot's description has already."""
     scale = Scale.of(measured.robot)
+    known = {(term.effect, Place(term.kind, term.name)) for term in measured.robot.terms}
     return [
         Hypothesis(effect, place, scale, shape)
         for effect in TERMS
         for place in _places(effect, measured)
+        if (effect, place) not in known
         for shape in _shapes(effect, place, measured, scale)
     ]
 

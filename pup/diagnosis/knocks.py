@@ -27,7 +27,8 @@ def knocked(robot: RobotDescription, recording: Recording) -> NDArray[np.bool_]:
     """Which ticks come just after a joint met its stop in model.xml, shape (n_ticks,)."""
     angle = Scale.of(robot).angle
     lower, upper = _stops(robot, recording.support)
-    position, time = np.asarray(recording.position), np.asarray(recording.time)
+    columns = [recording.joints.index(name) for name in robot.joint_names]
+    position, time = recording.position[:, columns], recording.time
     outside = (position < lower - BEYOND * angle) | (position > upper + BEYOND * angle)
     speed = np.abs(np.diff(position, axis=0)) / np.diff(time)[:, None]
     met = np.flatnonzero((outside[1:] & ~outside[:-1] & (speed > FAST * angle)).any(axis=1))

@@ -35,7 +35,7 @@ EQUATIONS = {
     "armature": "rotor inertia + J",
     "joint_spring": "tau += p - k q",
     "joint_stop": "tau -= k (q - a) beyond a",
-    "clock_skew": "commands act at t (1 + s)",
+    "clock_skew": "target(t) = command(t (1 + s))",
     "ground_compliance": "contact time constant + t",
     "ground_slope": "gravity turned by (roll, pitch)",
     "ground_friction": "friction of one foot + c",

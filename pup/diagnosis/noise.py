@@ -37,6 +37,8 @@ GAP = 1.7
 """Readings further apart than so many of the usual times have lost some between them."""
 DIGITS = 6
 """Decimals of a radian that readings are told apart by."""
+WHOLE = 2.65
+"""By so much the deviation of normal noise is larger than that of its quieter half."""
 ON_GRID, MOSTLY = 0.1, 0.9
 """Readings are quantised where so many of them lie within this share of a step of a grid."""
 KIND = 30
@@ -322,7 +324,7 @@ def _changes(measured: Measured, errors: Array, channel: int) -> tuple[list[Arra
         rests = [part for part in parts if len(part) >= 4]
         steps += rests
         bend = np.diff(step)
-        quiet = 2 * bend[np.abs(bend) <= np.median(np.abs(bend))]
+        quiet = WHOLE * bend[np.abs(bend) <= np.median(np.abs(bend))]
         bends += [np.diff(rest) for rest in rests] or [quiet]
     return steps, bends
 

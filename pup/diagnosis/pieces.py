@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from pup.recording import Recording
 from pup.recording_cuts import cut
@@ -17,6 +18,12 @@ STILL = 0.2
 """At rest, nothing has changed for so long, s."""
 SMALL = 0.01
 """Changes below this share of a joint's range are none."""
+FLICKER = 6.0
+"""Readings of a joint at rest differ by no more than so many standard deviations of their noise."""
+QUIETEST = 0.25
+"""Share of a recording in which joints are taken to rest, to see how their readings flicker."""
+STEP = 0.3
+"""Deviation of readings that are rounded to a step, as a share of it."""
 SHORTEST = 2.0
 """A part lasts as long at least, s."""
 FEWEST = 4
@@ -43,12 +50,28 @@ def _wakes(recording: Recording) -> NDArray[np.bool_]:
     """The last tick of each rest."""
     moving = np.zeros(len(recording.time), bool)
     small = SMALL * (np.nanmax(recording.target, axis=0) - np.nanmin(recording.target, axis=0))
+    read = np.maximum(small, FLICKER * _flicker(recording.position))
     for ago in (STILL, STILL / 2):  # at a turn, values of a while ago are the same again
         before = np.searchsorted(recording.time, recording.time - ago)
-        for values in (recording.target, recording.position):
-            moving |= (np.abs(values - values[before]) > small).any(axis=1)
+        for values, least in ((recording.target, small), (recording.position, read)):
+            moving |= (np.abs(values - values[before]) > least).any(axis=1)
     resting = ~moving & (recording.time - recording.time[0] >= STILL)
     return np.asarray(resting & np.append(moving[1:], False))
+
+
+def _flicker(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of each joint's readings at rest, steps of its encoder included, rad."""
+    told = np.zeros(position.shape[1])
+    for joint, column in enumerate(position.T):
+        read = column[~np.isnan(column)]
+        if len(read) < FEWEST:
+            continue
+        bends, steps = np.abs(np.diff(read, 2)), np.abs(np.diff(read))
+        white = np.sqrt(6) * stats.norm.ppf((1 + QUIETEST) / 2)  # of second differences
+        moved = steps[steps > 0]
+        step = moved.min() if len(moved) else 0.0
+        told[joint] = max(np.quantile(bends, QUIETEST) / white, STEP * step)
+    return told
 
 
 def _spaced(wakes: NDArray[np.float64], end: float) -> list[float]:

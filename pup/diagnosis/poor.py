@@ -91,13 +91,13 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
                 "blocked; look at it, or leave these recordings out",
                 f"with {name} mended",
             )
-        if _clipped(measured, j):
+        if _clipped(measured, j, WIDE * angle):
             yield Poor(
                 f"readings of {name} stop short at an end of their range, again and again at the "
                 "same value: they are clipped; record with the encoder's whole range",
                 f"with the whole range of the encoder of {name}",
             )
-    exchanged = _exchanged(measured, asked)
+    exchanged = _exchanged(measured, asked, ASKED * angle)
     if exchanged:
         yield Poor(
             f"readings of {exchanged[0]} follow the commands of {exchanged[1]}: columns or servo "
@@ -107,7 +107,8 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
 
 
 def _reach(values: Array) -> float:
-    return float(np.ptp(values)) if len(values) else 0.0
+    known = values[~np.isnan(values)]
+    return float(np.ptp(known)) if len(known) else 0.0
 
 
 def _ordered(measured: Measured, values: Sequence[Array]) -> list[Array]:
@@ -119,7 +120,7 @@ def _ordered(measured: Measured, values: Sequence[Array]) -> list[Array]:
     ]
 
 
-def _clipped(measured: Measured, joint: int) -> bool:
+def _clipped(measured: Measured, joint: int, wide: float) -> bool:
     """Whether readings stand still at an end of their range alone, whatever is commanded."""
     name, ends, others, asked = measured.robot.joint_names[joint], 0, 0, 0.0
     for number, recording in enumerate(measured.recordings):
@@ -142,10 +143,10 @@ def _clipped(measured: Measured, joint: int) -> bool:
                 asked = max(asked, _reach(np.concatenate([target[run] for run in long])))
         inside = (values[edges[:-1]] > values.min()) & (values[edges[:-1]] < values.max())
         others = max(others, int(lengths[inside].max()))
-    return asked > WIDE and others < USUAL * ends
+    return asked > wide and others < USUAL * ends
 
 
-def _exchanged(measured: Measured, asked: Array) -> tuple[str, str] | None:
+def _exchanged(measured: Measured, asked: Array, least: float) -> tuple[str, str] | None:
     """A joint whose readings follow another's commands, and that other."""
     read = np.concatenate(_ordered(measured, [r.position for r in measured.recordings]))
     names = measured.robot.joint_names
@@ -154,7 +155,7 @@ def _exchanged(measured: Measured, asked: Array) -> tuple[str, str] | None:
         return float(np.nanstd(read[:, joint] - asked[:, other]))
 
     for joint, other in permutations(range(len(names)), 2):
-        if _reach(asked[:, other]) < ASKED or np.isnan(read[:, joint]).all():
+        if _reach(asked[:, other]) < least or np.isnan(read[:, joint]).all():
             continue
         if off(joint, other) < EXCHANGED * off(joint, joint):
             return names[joint], names[other]

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.residuals import Measured
+from pup.physics.terms.scale import Scale
 
 Array = NDArray[np.float64]
 
@@ -74,7 +75,7 @@ def regimes(measured: Measured, simulated: Array, limits: Array, gains: Array) -
                 reversal[run] = gap < REVERSAL
     ours = measured.channel < joints
     fast = np.quantile(np.abs(speed[ours]), 0.85) if ours.any() else 0.0
-    slow = max(0.02 * fast, 0.01)
+    slow = max(0.02 * fast, 0.01 * Scale.of(measured.robot).angle)
     ground = np.array([r.support == "ground" for r in measured.recordings])[measured.recording]
     named = {
         "at reversals": ours & reversal & (np.abs(error) > 0),

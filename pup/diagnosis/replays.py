@@ -228,23 +228,20 @@ class Replays:
 
 def union(space: ParameterSpace, rows: Sequence[Row]) -> ParameterSpace:
     """A space with the columns of all terms that some rows name."""
-    extra: dict[tuple[str, Place], None] = {}
+    own: dict[tuple[str, Place], list[str]] = {}
+    for name in space.names:
+        if (told := split_column(name)) is not None:
+            own.setdefault((told[0], told[2]), []).append(name)
+    terms = dict.fromkeys(own)
     for row in rows:
         for name in row:
-            told = split_column(name)
-            if told is not None and name not in space.names:
-                extra[told[0], told[2]] = None
+            if name not in space.names and (told := split_column(name)) is not None:
+                terms[told[0], told[2]] = None
+    both = space.select([name for name in space.names if split_column(name) is None])
     # Where places overlap, the shape of the narrower counts, whatever else is in the batch.
-    ordered = sorted(extra, key=lambda term: WIDEST_FIRST.get(term[1].kind, 0))
-    spaces = [space, *(term_space(effect, place) for effect, place in ordered)]
-    return ParameterSpace(
-        sum((s.names for s in spaces), ()),
-        sum((s.units for s in spaces), ()),
-        *(
-            np.concatenate([getattr(s, key) for s in spaces])
-            for key in ("nominal", "lower", "upper")
-        ),
-    )
+    for term in sorted(terms, key=lambda term: WIDEST_FIRST.get(term[1].kind, 0)):
+        both = both.plus(space.select(own[term]) if term in own else term_space(*term))
+    return both
 
 
 def _effects(row: Row) -> tuple[str, ...]:

@@ -196,9 +196,8 @@ class _Report:
         """What it means that nothing is missing."""
         diagnosis = self.diagnosis
         tried = counted(len({t.hypothesis.key for t in diagnosis.found}), "combination")
-        slight = [r.chosen for r in diagnosis.rounds if r.accepted]
-        if slight:
-            named = listed([self.speech.words(h.effect, h.place) for h in slight])
+        if diagnosis.slight:
+            named = listed([self.speech.words(h.effect, h.place) for h in diagnosis.slight])
             yield (
                 f"Of {tried} of effect and place these motions show {named}, but too little to "
                 f"matter: below {SLIGHT:.0%} of what is typical, or of no use in predicting "
@@ -222,7 +221,7 @@ class _Report:
                 "With its parameters refitted, the simulator as it is will do for motions like "
                 "these."
             )
-        if not slight and diagnosis.rounds and diagnosis.rounds[-1].finalists:
+        if not diagnosis.slight and diagnosis.rounds and diagnosis.rounds[-1].finalists:
             closest = diagnosis.rounds[-1]
             named = self.speech.words(closest.chosen.effect, closest.chosen.place)
             yield f"Closest was {named}; {summary.why_rejected(closest, self.diagnosis)}."

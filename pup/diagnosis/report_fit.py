@@ -42,10 +42,13 @@ def _certificate(diagnosis: Diagnosis) -> str:
     )
     if not told.agree:
         return text + "do not agree."
-    return (
-        f"{text}agree. Fitted to a simulation of itself it comes back to within "
-        f"{max(told.recovered, 0.1):.1f} standard deviations ({SELF:g} are allowed)."
+    text += (
+        "agree. Fitted to a simulation of itself it comes back to within "
+        f"{max(told.recovered, 0.1):.1f} standard deviations ({SELF:g} are allowed)"
     )
+    if told.recovered <= SELF:
+        return f"{text}."
+    return f"{text}, but leaves no more than {told.left / told.samples:.1%} of the noise there."
 
 
 def _noise(diagnosis: Diagnosis, speech: Speech) -> str:

@@ -17,7 +17,9 @@ from scipy.linalg import solve_banded
 
 from pup.diagnosis.knocks import knocked
 from pup.physics.simulator import Trajectories, tick_slices
+from pup.physics.terms.scale import Scale
 from pup.recording import Recording, originals
+from pup.recording_cuts import with_commands
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
@@ -30,6 +32,12 @@ AROUND = 0.06
 """Time before and after a sample whose speed counts as that of the motion about it, s."""
 NEARBY = 0.045
 """The same for the readings that tell a speed: through several, noise hardly tilts a line."""
+BESIDE = 1.2
+"""Both reach this share of the time between readings at least: the next ones to both sides."""
+CALM = 0.012
+"""Readings that differ by less are of a joint at rest, rad."""
+FLAT = 1.4
+"""Pitch beyond which the torso lies on its face or back, rad."""
 LOST = 3.0
 """Error counted for a simulation that broke down, rad."""
 
@@ -98,8 +106,8 @@ class Measured:
           recordings: its recordings.
           wholes: what each is the beginning of: whether a stop was met, a whole recording tells.
         """
-        steadied = tuple(steady_start(recording) for recording in recordings)
-        joints = len(robot.joints)
+        angle, joints = Scale.of(robot).angle, len(robot.joints)
+        steadied = tuple(steady_start(with_commands(r), CALM * angle) for r in recordings)
         ticks = sum(len(r.time) for r in steadied)
         parts = []
         for number, (recording, whole, part) in enumerate(
@@ -152,7 +160,11 @@ class Measured:
         """The trajectories at the samples, shape (n_candidates, n_samples); NaN where diverged."""
         n = len(trajectories.position)
         flat = np.hstack([trajectories.position.reshape(n, -1), trajectories.tilt.reshape(n, -1)])
-        return flat[:, self.index]
+        picked = flat[:, self.index]
+        tilts = self.channel >= len(self.robot.joints)  # a turn more or less is the same
+        turns = np.round((picked[:, tilts] - self.values[tilts]) / (2 * np.pi))
+        picked[:, tilts] -= 2 * np.pi * turns
+        return np.asarray(picked)
 
     def memory(self, noise: Noise) -> Array:
         """Correlation of each sample's noise with that of the one before, shape (n_samples,)."""
@@ -196,25 +208,30 @@ class Measured:
 
 
 def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:
-    """Positions in the robot's order, then roll and pitch where the torso is free."""
+    """Positions in the robot's order, then roll and pitch where the torso is free.
+
+    Where the torso lies on its face or back, roll turns over at once and tells nothing.
+    """
     columns = [recording.position[:, recording.joints.index(name)] for name in robot.joint_names]
     if recording.support == "ground":
         absent = np.full(len(recording.time), np.nan)
-        columns += [recording.extras.get(f"imu/{a}", absent) for a in ("roll", "pitch")]
+        roll, pitch = (recording.extras.get(f"imu/{a}", absent) for a in ("roll", "pitch"))
+        columns += [np.where(np.abs(pitch) > FLAT, np.nan, roll), pitch]
     return columns
 
 
 def _speeds(time: Array, values: Array) -> Array:
     """Root mean square, about each time, of the slopes of lines through the values nearby."""
-    squares = _slopes(time, values) ** 2
-    (total,), count = _sums(time, AROUND, squares)
+    apart = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    squares = _slopes(time, values, max(NEARBY, BESIDE * apart)) ** 2
+    (total,), count = _sums(time, max(AROUND, BESIDE * apart), squares)
     return np.asarray(np.sqrt(np.maximum(total, 0.0) / count))
 
 
-def _slopes(time: Array, values: Array) -> Array:
+def _slopes(time: Array, values: Array, reach: float) -> Array:
     """Slopes of lines through the values near each time; 0 where there is only one."""
     x, y = time - time.mean(), values - values.mean()
-    (sx, sy, sxx, sxy), count = _sums(time, NEARBY, x, y, x * x, x * y)
+    (sx, sy, sxx, sxy), count = _sums(time, reach, x, y, x * x, x * y)
     alone = count < 2
     return np.where(alone, 0.0, (count * sxy - sx * sy) / np.where(alone, 1, count * sxx - sx * sx))
 
@@ -227,11 +244,15 @@ def _sums(time: Array, reach: float, *values: Array) -> tuple[list[Array], NDArr
     return [s[last] - s[first] for s in sums], last - first
 
 
-def steady_start(recording: Recording) -> Recording:
+def steady_start(recording: Recording, small: float) -> Recording:
     """The recording with its first positions averaged over the time before anything moves.
 
     Where a joint stands at the start is where its simulation starts, and a joint with dry friction
     stays there: one reading's noise would stay with it.
+
+    Args:
+      recording: with the commands that each row holds.
+      small: by what readings may differ that are noise and quantisation, no motion, rad.
     """
     moved = np.flatnonzero(np.any(recording.target != recording.target[0], axis=1))
     rest = int(moved[0]) if len(moved) else len(recording.time)
@@ -241,6 +262,6 @@ def steady_start(recording: Recording) -> Recording:
     position = recording.position.copy()
     first = position[:rest]
     spread = np.nanmax(first, axis=0) - np.nanmin(first, axis=0)
-    calm = spread < 0.012  # noise and quantisation, no motion
+    calm = spread < small
     position[0, calm] = np.nanmean(first[:, calm], axis=0)
     return replace(recording, position=position)

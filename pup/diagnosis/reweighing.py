@@ -91,9 +91,8 @@ class Reweighing:
         before = models[chosen.before]
         first, *others = (models[m] for m in _worth_keeping(chosen))
         holds, rest = selector.parted(before, others)
-        return Round(
-            before, self._ranking(chosen, before.fit), (first, *holds, *rest), 1 + len(holds)
-        )
+        ranking = self._ranking(chosen, before.fit)
+        return Round(before, ranking, (first, *holds, *rest), 1 + len(holds), chosen.again)
 
     def _ranking(self, chosen: Round, base: Fit) -> tuple[Score, ...]:
         refitted = {m.hypotheses[-1] for m in _worth_keeping(chosen)}

@@ -315,7 +315,7 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     "stribeck_friction": _stribeck,
     "presliding_hysteresis": _presliding,
     "load_dependent_friction": lambda f: (
-        f"{f.at} lose{f.s} {percent(f.size['share'])} of the load that it carries to friction."
+        f"{f.at} lose{f.s} {percent(2 * f.size['share'])} of the load that it carries to friction."
     ),
     "gear_efficiency": lambda f: (
         f"The gear of {f.at} loses {percent(f.size['loss'])} of the torque it passes on."

@@ -92,9 +92,7 @@ def signals(
 def _command(recording: Recording, joint: str, time: Array) -> tuple[Array, Array]:
     """The command held at some times, and its age."""
     elapsed = recording.time - recording.time[0]
-    told = recording.target[:, recording.joints.index(joint)]
-    known = np.maximum.accumulate(np.where(np.isnan(told), 0, np.arange(len(told))))
-    held = told[known]
+    held = recording.target[:, recording.joints.index(joint)]
     rows = np.clip(np.searchsorted(elapsed, time, "right") - 1, 0, len(elapsed) - 1)
     moved = np.append(False, np.nan_to_num(np.diff(held)) != 0)
     last = np.maximum.accumulate(np.where(moved, elapsed, -np.inf))
