@@ -32,8 +32,8 @@ def experiment(verb: argparse.ArgumentParser) -> None:
         "--stages",
         type=_words,
         metavar="S,...",
-        help="record, presysid, policy, trials, prior, diagnosis, corrected, diagnosed; with what "
-        "they need",
+        help="record, presysid, policy, trials, prior, diagnosis, corrected, diagnosed, "
+        "undiagnosed; with what they need",
     )
     what.add_argument(
         "--policies",

@@ -130,7 +130,7 @@ def _show_files(shown: dict[str, Any]) -> None:
 
 
 def _show_recordings(shown: dict[str, Any]) -> None:
-    for path in shown["recordings"]:
+    for path in shown.get("scripts") or shown["recordings"]:
         print(path)
 
 

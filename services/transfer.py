@@ -168,6 +168,11 @@ def transfer(
     check_name(wanted.study)
     policy = NumpyPolicy.load(wanted.policy)
     card = policy.card
+    if not card.eta_lower:
+        raise InputError(
+            f"{wanted.policy}: is a {card.method} policy, conditioned on nothing, so that there is "
+            "no eta to search; give one of `pup train --method pup` or `up`"
+        )
     digest = sha256(wanted.policy / CARD)
     gateway = Gateway(wanted.url, wanted.token, told)
     asked = {

@@ -59,6 +59,13 @@ def test_record_writes_recordings_of_a_virtual_robot(tmp_path: Path, check: Chec
     assert json.loads((tmp_path / "truth.json").read_text())["robot"] == "servo_bench"
 
 
+def test_record_writes_scripts_for_a_robot_to_play(tmp_path: Path) -> None:
+    done = pup("record", "step:0.1", "--scripts", "--robot", "darwin_leg", "--out", tmp_path)
+    assert done.code == 0, done.err
+    assert done.out.splitlines() == [str(tmp_path / "step_0.1.json")]
+    assert (tmp_path / "step_0.1.json").is_file()
+
+
 def test_record_again_writes_the_same(tmp_path: Path) -> None:
     command = ("record", "step:0.1", "--virtual", "--robot", "servo_bench", "--repeats", 2)
     for folder in ("a", "b", "a"):

@@ -9,6 +9,8 @@ import pytest
 from commandline import pup
 from refusals import Cases, Made, Place, assert_refused, check
 
+from pup.policy.shape import Method
+
 pytest.importorskip("fastapi")
 pytest.importorskip("botorch")
 
@@ -39,6 +41,12 @@ def bundle(place: Place) -> Path:
 @case("a policy that is not there")
 def _(place: Place) -> Made:
     return transfer(place, "--policy", place.here / "none"), ("none", "cannot be read")
+
+
+@case("a policy that is conditioned on nothing")
+def _(place: Place) -> Made:
+    policy = agents.bundle(place.here / "policy", method=Method.ROBUST)
+    return transfer(place, "--policy", policy), (policy, "robust", "no eta", "--method pup")
 
 
 @case("a gateway that is not there")

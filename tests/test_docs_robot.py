@@ -78,9 +78,9 @@ def test_links_lead_somewhere(page: str) -> None:
 
 def test_the_pages_name_options_that_exist() -> None:
     """Every `pup VERB ... --option` of the pages is one that the verb's help tells."""
-    for page in ("robots.md", "recordings.md", "../README.md"):
+    for page in ("robots.md", "real-robot.md", "run.md", "recordings.md", "../README.md"):
         for block in blocks(page, "sh"):
-            for line in block.splitlines():
+            for line in block.replace("\\\n", " ").splitlines():
                 if not line.startswith("pup "):
                     continue
                 verb = shlex.split(line)[1]

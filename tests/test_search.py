@@ -11,7 +11,7 @@ from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fitting import Fit
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
-from pup.diagnosis.pieces import SHORTEST, STILL, pieces
+from pup.diagnosis.pieces import SHORTEST, STILL, origins, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.search import followed, in_the_air, search
@@ -69,6 +69,18 @@ class TestPieces:
         read = np.round(read / step) * step if step else read
         two = replace(whole, joints=("a", "b"), target=both[0], position=read)
         assert len(pieces([two])) == 4
+
+    def test_parts_know_where_in_the_recording_they_begin(self) -> None:
+        whole = moves([1.5] * 4)
+        parts = pieces([whole])
+        told = origins([whole], parts)
+        elapsed = whole.time - whole.time[0]
+        for part in parts:
+            name, begin = told[part.id]
+            assert name == whole.id
+            rows = (elapsed >= begin) & (elapsed <= begin + part.time[-1])
+            assert np.array_equal(whole.position[rows], part.position)
+        assert origins([whole, whole], [whole, whole]) == {}
 
     def test_what_never_rests_or_is_short_stays_whole(self) -> None:
         (short,) = pieces([moves([1.5])])

@@ -7,6 +7,7 @@ import numpy as np
 
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import contract_name
+from pup.diagnosis.regimes import Window
 from pup.diagnosis.verdict import Alternative, Finding, HeldOut
 from pup.diagnosis.wording import SLIDING
 from pup.physics.terms import TERMS, Term
@@ -43,8 +44,8 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
             "rms": float(np.sqrt(np.mean(noise.sigma[:joints] ** 2))),
             "source": noise.source,
         },
-        "findings": [_finding(f, robot, units) for f in diagnosis.findings],
-        "held_out": _held_out(diagnosis.held_out),
+        "findings": [_finding(f, diagnosis, units) for f in diagnosis.findings],
+        "held_out": _held_out(diagnosis.held_out, diagnosis.origins),
         "next_recording": diagnosis.ask.document() if diagnosis.ask else None,
         "corrected_robot": corrected,
         "certificate": {
@@ -57,12 +58,13 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
     }
 
 
-def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]) -> dict[str, Any]:
+def _finding(finding: Finding, diagnosis: Diagnosis, units: Mapping[str, str]) -> dict[str, Any]:
+    robot = diagnosis.robot
     return {
         "effect": contract_name(finding.effect),
         "place": _place(finding, robot),
         "regime": finding.regime,
-        "when": [{"recording": w.recording, "start": w.start, "end": w.end} for w in finding.when],
+        "when": [_window(window, diagnosis.origins) for window in finding.when],
         "parameters": {
             name: {
                 "value": p.value,
@@ -85,6 +87,12 @@ def _finding(finding: Finding, robot: RobotDescription, units: Mapping[str, str]
     }
 
 
+def _window(window: Window, origins: Mapping[str, tuple[str, float]]) -> dict[str, Any]:
+    """A stretch of time, of a part in seconds of the recording that it was cut from."""
+    recording, begin = origins.get(window.recording, (window.recording, 0.0))
+    return {"recording": recording, "start": begin + window.start, "end": begin + window.end}
+
+
 def _place(claim: Finding | Alternative, robot: RobotDescription) -> dict[str, Any]:
     """A place by the contract's kinds: what all servos do is told as of all groups."""
     place = claim.place
@@ -94,11 +102,13 @@ def _place(claim: Finding | Alternative, robot: RobotDescription) -> dict[str, A
     return {"kind": place.kind, "names": [place.name or named[place.kind]]}
 
 
-def _held_out(errors: HeldOut | None) -> dict[str, Any] | None:
+def _held_out(
+    errors: HeldOut | None, origins: Mapping[str, tuple[str, float]]
+) -> dict[str, Any] | None:
     if errors is None:
         return None
     return {
-        "recordings": list(errors.recordings),
+        "recordings": list(dict.fromkeys(origins.get(r, (r, 0.0))[0] for r in errors.recordings)),
         "rmse_before": errors.before,
         "rmse_after": errors.after,
         "improvement_ci90": list(errors.interval),

@@ -1,7 +1,7 @@
 """The whole diagnosis: from recordings to what the simulator leaves out."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.noise import assumed_noise, quiet_noise, told_anew
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal, unfitted
-from pup.diagnosis.pieces import pieces
+from pup.diagnosis.pieces import origins, pieces
 from pup.diagnosis.poor import Poor, why_poor
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.repeatability import unrepeated
@@ -69,6 +69,7 @@ class Diagnosis:
       missing: the torques that the nominal model lacks; None where nothing is to be explained.
       unexplained: what the known effects leave; None where that is noise.
       slight: effects that were found and do not matter.
+      origins: of parts of one recording, that recording's id and when in it each begins, s.
       splits: how the nominal model's parameters differ between halves of the data, and how those
         of the model with what was found.
     """
@@ -91,6 +92,7 @@ class Diagnosis:
     missing: MissingInput | None = None
     unexplained: Unexplained | None = None
     slight: tuple[Hypothesis, ...] = ()
+    origins: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
 
     @property
@@ -120,7 +122,8 @@ def diagnose(
       effects: that are looked for at most; each may act at several places.
     """
     rng = np.random.default_rng(seed)
-    measured = Measured.of(robot, pieces(recordings))
+    parts = pieces(recordings)
+    measured = Measured.of(robot, parts)
     replays = Replays(measured, robot_space(robot, "pd"), runner(measured), lanes)
     progress("nominal fit", 0.0)
     poor, noise = why_poor(measured), assumed_noise(measured)
@@ -146,6 +149,7 @@ def diagnose(
             nominal=nominal,
             regimes=tuple(seen),
             replays=replays.count,
+            origins=origins(recordings, parts),
             **(known | more),
         )
 

@@ -23,6 +23,13 @@ def folds(replays: Replays) -> list[list[int]]:
     return types if len(types) > 1 else apart(replays.measured)
 
 
+def fold_words(measured: Measured) -> str:
+    """What `folds` leaves out at a time, in words."""
+    if len(measured.motions()) > 1:
+        return "type of motion"
+    return "motion" if len(measured.families()) > 1 else "recording"
+
+
 def apart(measured: Measured) -> list[list[int]]:
     """Recordings by motion, as one done again tells little new; each alone where all are one."""
     families = list(measured.families().values())

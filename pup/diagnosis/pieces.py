@@ -46,6 +46,23 @@ def pieces(recordings: Sequence[Recording]) -> list[Recording]:
     return [cut(whole, start, stop) for start, stop in pairwise([*starts, np.inf])]
 
 
+def origins(
+    recordings: Sequence[Recording], parts: Sequence[Recording]
+) -> dict[str, tuple[str, float]]:
+    """The recording that each part is of, and when in it the part begins, s; empty without parts.
+
+    Args:
+      recordings: as they were given.
+      parts: what `pieces` made of them.
+    """
+    if len(parts) == len(recordings):
+        return {}
+    (whole,) = recordings
+    rows = np.cumsum([0, *(len(part.time) for part in parts)])
+    begin = (whole.time - whole.time[0])[rows[:-1]]
+    return {part.id: (whole.id, float(b)) for part, b in zip(parts, begin, strict=True)}
+
+
 def _wakes(recording: Recording) -> NDArray[np.bool_]:
     """The last tick of each rest."""
     moving = np.zeros(len(recording.time), bool)

@@ -15,6 +15,7 @@ from pup.diagnosis.figures import (
     misfit_time,
     window,
 )
+from pup.diagnosis.folds import fold_words
 from pup.diagnosis.summary import View
 from pup.diagnosis.wording import Speech, capital, percent, spoken
 from pup.sysid.figures import INK, SOFT
@@ -37,8 +38,8 @@ def before_and_after(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     corrected = summary.corrected(diagnosis)
     yield tag(
         "p",
-        "Every error here is of a prediction: motions of one type were left out, the model fitted "
-        "to all others, and its simulation compared with what was left out.",
+        f"Every error here is of a prediction: one {fold_words(diagnosis.measured)} at a time was "
+        "left out, the model fitted to all others, and its simulation compared with it.",
     )
     noise = summary.joint_noise(diagnosis)
     joints = {spoken(name): pair for name, pair in held.per_joint.items()}

@@ -7,6 +7,7 @@ import numpy as np
 from pup.diagnosis import summary
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.folds import fold_words
 from pup.diagnosis.nominal import SELF
 from pup.diagnosis.wording import Speech, capital, change, digits, parameter_words
 from pup.physics.terms import split_column
@@ -135,5 +136,6 @@ def _recordings(diagnosis: Diagnosis, speech: Speech) -> Html:
         rows.append([*row, setup(recording)] if knobs else row)
     caption = "Recordings"
     if models:
-        caption += ", with the joint errors of models that were fitted without their type of motion"
+        left = "themselves" if (one := fold_words(measured)) == "recording" else f"their {one}"
+        caption += f", with the joint errors of models that were fitted without {left}"
     return table(caption, columns, rows)

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 from pup.diagnosis import summary
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures_rivals import rival_dots
+from pup.diagnosis.folds import fold_words
+from pup.diagnosis.residuals import Measured
 from pup.diagnosis.rivals import DIAGNOSED, NETWORK, NN_PD, NOMINAL, Errors, Rivals
 from pup.diagnosis.wording import Speech, capital, minus, percent, spoken
 from pup.sysid.html import Column, Html, figure, table, tag
@@ -22,7 +24,7 @@ def beside(diagnosis: Diagnosis, speech: Speech, rivals: Rivals | None) -> Itera
     """What the corrected model is worth beside others that were fitted to the same recordings."""
     if rivals is None:
         return
-    yield tag("p", _about(rivals, speech))
+    yield tag("p", _about(rivals, diagnosis.measured, speech))
     errors = dict(rivals.errors)
     if not summary.corrected(diagnosis):
         del errors[DIAGNOSED]  # it is the nominal model
@@ -63,15 +65,15 @@ def _named(model: str) -> str:
     return LABELS[model] if model == NN_PD else f"the {LABELS[model]}"
 
 
-def _about(rivals: Rivals, speech: Speech) -> str:
+def _about(rivals: Rivals, measured: Measured, speech: Speech) -> str:
     """What the rivals are and how they were fitted."""
     network = (
         "The residual network learns what the nominal model's simulation leaves of a reading from "
         "what that simulation knows then and just before."
     )
     whole = (
-        "Each model was fitted to the same recordings without one type of motion and predicts "
-        "that type."
+        "Each model was fitted to the same recordings without one "
+        f"{fold_words(measured)} and predicts it."
     )
     if rivals.nn_pd_fit is None:
         return f"{network} {whole}"

@@ -13,6 +13,11 @@ REFERENCE_TORQUE = 2.5
 REFERENCE_RANGE = 2.0
 """Range of a joint, rad, that they belong to."""
 
+REFERENCE_MASS = 2.93
+"""Mass of the Darwin OP2, kg."""
+
+_MASSES = {"kg": 1.0, "N": 1.0, "m": 1 / 3}
+"""Powers of the mass of a heavier robot: its loads, the forces on it, its lengths."""
 _POWERS = {
     # unit: powers of torque and of angle
     "N m": (1, 0),
@@ -37,10 +42,12 @@ class Scale:
     Attributes:
       torque: strength of the robot's servos over the reference.
       angle: range of its joints over the reference; 1 for hinges.
+      mass: of the robot over the reference; 1 for lighter ones, as parts of one are.
     """
 
     torque: float
     angle: float
+    mass: float
 
     @classmethod
     def of(cls, robot: RobotDescription) -> "Scale":
@@ -51,9 +58,14 @@ class Scale:
         kinds = [model.joint(name).type[0] for name in robot.joint_names]
         slides = mujoco.mjtJoint.mjJNT_SLIDE in kinds
         ranges = [joint.upper - joint.lower for joint in robot.joints]
-        return cls(torque, float(np.median(ranges)) / REFERENCE_RANGE if slides else 1.0)
+        return cls(
+            torque,
+            float(np.median(ranges)) / REFERENCE_RANGE if slides else 1.0,
+            max(1.0, float(model.body_mass.sum()) / REFERENCE_MASS),
+        )
 
     def factor(self, unit: str) -> float:
         """On a quantity of some unit."""
         torque, angle = _POWERS.get(unit, (0, 0))
-        return float(self.torque**torque * self.angle**angle)
+        mass = _MASSES.get(unit, 0.0)
+        return float(self.torque**torque * self.angle**angle * self.mass**mass)
