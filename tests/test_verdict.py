@@ -162,6 +162,9 @@ def test_an_interval_is_as_wide_as_a_law_of_another_form_asks() -> None:
     assert (blunt.lower, blunt.upper) == pytest.approx((0.0483, 0.2008), abs=1e-4)
     most = Parameter(torque.limit, "N m", 0.9 * torque.limit, torque.limit)
     assert of_other_form(most, torque).upper == torque.limit
+    large = Parameter(20 * torque.limit, "N", 19 * torque.limit, 21 * torque.limit)
+    told = of_other_form(large, torque, 200.0)  # of an axis of 600 N
+    assert told.lower < large.lower < large.value < large.upper < told.upper
     shape = next(q for q in TERMS["stribeck_friction"].quantities if q.shape)
     speed = Parameter(0.1, "rad/s", 0.09, 0.11)
     assert of_other_form(speed, shape) == speed

@@ -315,7 +315,9 @@ def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
         fitted = Parameter(
             coordinate.value(at), quantities[quantity].unit, *(coordinate.value(e) for e in ends)
         )
-        told[quantity] = fitted if term.constant else of_other_form(fitted, quantities[quantity])
+        factor = hypothesis.scale.factor(quantities[quantity].unit)
+        law = of_other_form(fitted, quantities[quantity], factor)
+        told[quantity] = fitted if term.constant else law
     for name, value in final.fit.fixed.items():
         quantity = _quantity(name, hypothesis)
         if quantity is not None:
@@ -323,17 +325,23 @@ def _parameters(hypothesis: Hypothesis, final: Model) -> dict[str, Parameter]:
     return told
 
 
-def of_other_form(fitted: Parameter, quantity: Quantity) -> Parameter:
+def of_other_form(fitted: Parameter, quantity: Quantity, factor: float = 1.0) -> Parameter:
     """A law's fitted quantity, its interval widened by what a real law's own form may make of it.
 
     A shape says how the form acts that was fitted; a real one's need not have it.
+
+    Args:
+      fitted: as the law has it.
+      quantity: what it is.
+      factor: of the robot's scale on the quantity's ends.
     """
     if quantity.shape:
         return fitted
     value, form = fitted.value, OTHER_FORM * abs(fitted.value)
     lower = value - float(np.hypot(value - fitted.lower, form))
     upper = value + float(np.hypot(fitted.upper - value, form))
-    return replace(fitted, lower=max(lower, quantity.lower), upper=min(upper, quantity.limit))
+    ends = factor * quantity.lower, factor * quantity.limit
+    return replace(fitted, lower=max(lower, ends[0]), upper=min(upper, ends[1]))
 
 
 def _uneven(hypothesis: Hypothesis, final: Model, noise: Noise) -> dict[str, Parameter]:
