@@ -2,14 +2,16 @@
 
 import math
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hardware_agent.bus import Answers, Bus
-from hardware_agent.config import Settings
+from hardware_agent.config import BusSettings, Settings
 from hardware_agent.imu import Orientation, imu_of
 from hardware_agent.limits import Applied, Limiter
+from hardware_agent.mounting import Mounting
 from hardware_agent.port import BusError
 from hardware_agent.safety import Guard
 from hardware_agent.senses import Response, Senses, Trip
@@ -31,7 +33,7 @@ class Body:
       robot: its description, with a servo for every joint.
 
     Raises:
-      InputError: a joint has no servo.
+      InputError: a joint has no servo, or one that is mounted as none of this robot can be.
     """
 
     def __init__(self, settings: Settings, robot: RobotDescription) -> None:
@@ -43,9 +45,11 @@ class Body:
             raise InputError(f"{robot.folder / 'robot.toml'}: joint {lacking!r} has no servo_id")
         self.ids = [number for number in ids if number is not None]
         self.imu = imu_of(settings.imu)
-        self.bus = Bus(settings.bus, self.ids, senses=settings.imu.kind == "cm740")
+        mountings = _mountings(settings.bus, robot)
+        senses = settings.imu.kind == "cm740"
+        self.bus = Bus(settings.bus, self.ids, senses, mountings)
         self.guard = Guard(settings.safety, robot.gait.tilt_limit if robot.gait else TILT)
-        self.limiter = Limiter(self.names, *robot.limits, settings.safety)
+        self.limiter = Limiter(self.names, *_reached(robot, mountings), settings.safety)
         self.torque = self.ready = False
         self.repeated = self.lost = 0
         self._forget()
@@ -269,3 +273,30 @@ class Body:
         except BusError:
             return False
         return True
+
+
+def _mountings(settings: BusSettings, robot: RobotDescription) -> list[Mounting]:
+    """How the servo of each joint is mounted, in the order of the joints."""
+    for name in settings.joints:
+        if name not in robot.joint_names:
+            known = ", ".join(robot.joint_names)
+            raise InputError(
+                f"bus.joints.{name}: robot {robot.name!r} has no such joint; it has {known}"
+            )
+    return [settings.joints.get(name, Mounting()) for name in robot.joint_names]
+
+
+def _reached(robot: RobotDescription, mountings: Sequence[Mounting]) -> tuple[Array, Array]:
+    """The joints' ranges as far as their servos reach, rad.
+
+    A target beyond that is held back here already: so the recording tells what the servo was told.
+    """
+    reach = np.array([mounting.reach for mounting in mountings])
+    lower, upper = robot.limits
+    least, largest = np.maximum(lower, reach[:, 0]), np.minimum(upper, reach[:, 1])
+    for j in np.flatnonzero(least >= largest):
+        raise InputError(
+            f"bus.joints.{robot.joint_names[j]}: the servo reaches {reach[j, 0]:.2f} to "
+            f"{reach[j, 1]:.2f} rad only, the joint's range is {lower[j]:.2f} to {upper[j]:.2f}"
+        )
+    return least, largest

@@ -16,6 +16,7 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from numpy.typing import NDArray
 
 from hardware_agent.config import BusSettings
+from hardware_agent.mounting import Mounting
 from hardware_agent.plausible import Plausible
 from hardware_agent.port import FAILURES, BusError, Port, device_error
 from hardware_agent.registers import (
@@ -25,7 +26,6 @@ from hardware_agent.registers import (
     Span,
     Status,
     hardware_alarm,
-    ticks,
 )
 from pup.errors import InputError
 
@@ -62,11 +62,20 @@ class Bus:
       settings: of the port.
       ids: of the servos, in the order of the joints.
       senses: whether the board's inertial sensors are read with the servos.
+      mountings: of the servos, in the same order; without, all are as from the factory.
     """
 
-    def __init__(self, settings: BusSettings, ids: Sequence[int], senses: bool = False) -> None:
+    def __init__(
+        self,
+        settings: BusSettings,
+        ids: Sequence[int],
+        senses: bool = False,
+        mountings: Sequence[Mounting] | None = None,
+    ) -> None:
         self.settings = settings
         self.ids = tuple(ids)
+        told = [Mounting()] * len(self.ids) if mountings is None else mountings
+        self._mountings = dict(zip(self.ids, told, strict=True))
         self.registers = REGISTERS[settings.protocol]
         self._senses = senses
         self._port = Port(settings.port, settings.baud, settings.timeout)
@@ -159,7 +168,7 @@ class Bus:
         Args:
           goals: finite, rad, in the order of the ids.
         """
-        self._send(self.registers.goal, {n: ticks(g) for n, g in zip(self.ids, goals, strict=True)})
+        self._send(self.registers.goal, self._ticks(goals))
 
     def torque(self, on: bool) -> None:
         """Make all servos hold, or limp."""
@@ -185,7 +194,7 @@ class Bus:
 
     def without(self, goals: Sequence[float] | Array) -> list[int]:
         """Servos that have other goals than these, or do not say which."""
-        wanted = {name: ticks(goal) for name, goal in zip(self.ids, goals, strict=True)}
+        wanted = self._ticks(goals)
         with self._told():
             return [
                 name
@@ -211,6 +220,11 @@ class Bus:
         with self._told():
             told = self._register(name, self.registers.torque_enable)
         return None if told is None else bool(told)
+
+    def _ticks(self, goals: Iterable[float]) -> dict[int, int]:
+        """Goals of joints, rad, as the servos are told them, by id."""
+        each = zip(self.ids, goals, strict=True)
+        return {name: self._mountings[name].ticks(goal) for name, goal in each}
 
     def _detailed(self) -> Collection[int]:
         """Who tells more than its position: all, or one after the other."""
@@ -278,7 +292,8 @@ class Bus:
             if name == self.settings.board:
                 board[name] = data
                 continue
-            status = self.registers.status(data, packet[at], name in detailed)
+            mounting = self._mountings[name]
+            status = self.registers.status(data, packet[at], name in detailed, mounting)
             if self._plausible.believes(name, status.position, time.monotonic()):
                 found[name] = status
 

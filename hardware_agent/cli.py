@@ -3,6 +3,7 @@
 import argparse
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -17,6 +18,7 @@ from pup.errors import InputError
 DONE, FAILED, REFUSED = 0, 1, 2
 PLACE = "/etc/pup-agent/agent.toml"
 SCRIPTS = "file of `pup record --scripts`, or a folder of them"
+SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
 
 
@@ -67,6 +69,9 @@ def _parser() -> argparse.ArgumentParser:
             verb.add_argument("scripts", type=Path, nargs="+", metavar="SCRIPT", help=SCRIPTS)
             verb.add_argument("--repeats", type=int, default=1, metavar="N", help="of each script")
             verb.add_argument("--auto", action="store_true", help='ask nobody; needs gate = "auto"')
+            verb.add_argument(
+                "--setup", nargs="+", action="extend", default=[], metavar="KNOB=NUMBER", help=SETUP
+            )
         elif name == "keys":
             verb.add_argument("name", help="of the files NAME.key and NAME.key_secret")
             verb.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -179,12 +184,31 @@ def _play(options: argparse.Namespace) -> int:
 
     if not 1 <= options.repeats <= MOST:
         raise InputError(f"--repeats: {options.repeats} is not 1 to {MOST}")
+    setup = _knobs(options.setup)
     files = [
         f for at in options.scripts for f in (sorted(at.glob("*.json")) if at.is_dir() else [at])
     ]
     if not files:
         raise InputError(f"{options.scripts[0]}: no *.json in this folder")
-    return play(Settings.read(options.config).socket, files, options.repeats, options.auto)
+    socket = Settings.read(options.config).socket
+    return play(socket, files, options.repeats, options.auto, setup)
+
+
+def _knobs(told: Sequence[str]) -> dict[str, float]:
+    """What `--setup` says; the agent knows which knobs there are."""
+    setup: dict[str, float] = {}
+    for text in told:
+        name, _, value = text.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not name or not math.isfinite(number):
+            raise InputError(f"--setup: {text!r} is not KNOB=NUMBER")
+        if name in setup:
+            raise InputError(f"--setup: {name} is told twice")
+        setup[name] = number
+    return setup
 
 
 def _keys(options: argparse.Namespace) -> int:

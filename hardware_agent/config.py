@@ -6,11 +6,12 @@ write down only what your robot needs otherwise.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
+from hardware_agent.mounting import LAST, Mounting
 from pup.errors import InputError
 from pup.robot_toml import Table, read_text
 
@@ -36,6 +37,7 @@ class BusSettings:
       tries: how often a tick asks those that did not answer.
       gains: P, I, D of the servos' firmware; None for the paper's 32, 0, 16 (section VI-A), which
         with Protocol 2.0 are 512, 0, 1.
+      joints: by name, how the servos of some joints are mounted; others as from the factory.
     """
 
     port: str
@@ -48,6 +50,7 @@ class BusSettings:
     timeout: float = 0.004
     tries: int = 3
     gains: tuple[int, ...] | None = None
+    joints: Mapping[str, Mounting] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -273,6 +276,7 @@ CHOICES: Mapping[tuple[str, str], tuple[object, ...]] = {
     ("BusSettings", "read"): ("bulk", "sync"),
     ("BusSettings", "write"): ("sync", "bulk"),
     ("BusSettings", "detail"): ("all", "rotating"),
+    ("Mounting", "sign"): (1, -1),
     ("ImuSettings", "kind"): ("bno055-uart", "bno055-i2c", "cm740", "none"),
     ("ControlSettings", "clock"): ("wall", "lockstep"),
     ("ControlSettings", "gate"): ("operator", "auto"),
@@ -283,6 +287,7 @@ LIMITS: Mapping[tuple[str, str], tuple[float, float]] = {
     ("BusSettings", "timeout"): (0.0005, 1.0),
     ("BusSettings", "tries"): (1, 10),
     ("BusSettings", "board"): (0, 252),
+    ("Mounting", "zero"): (0, LAST),
     ("ImuSettings", "timeout"): (0.0005, 1.0),
     ("ControlSettings", "rate"): (5.0, 500.0),
     ("ControlSettings", "ramp"): (0.5, 60.0),
@@ -330,6 +335,9 @@ def _value(table: Table, key: str, hint: Any) -> Any:
         return table.integer(key)
     if hint is float:
         return table.number(key)
+    if get_origin(hint) is Mapping:
+        named = table.table(key)
+        return {name: _part(named.table(name), Mounting) for name in named.left()}
     assert get_origin(hint) is tuple
     if get_args(hint)[0] is str:
         return table.texts(key)
@@ -342,7 +350,7 @@ def _check(table: Table, kind: type[Any], key: str, value: Any) -> None:
     if choices is not None and value not in choices:
         told = ", ".join(repr(c) for c in choices)
         raise table.mistake(key, f"{value!r}; use one of {told}")
-    if type(value) in (int, float):
+    if choices is None and type(value) in (int, float):
         low, high = LIMITS.get((kind.__name__, key), (1e-6, 1e9))
         if not low <= value <= high:
             raise table.mistake(key, f"{value:g} is outside [{low:g}, {high:g}]")

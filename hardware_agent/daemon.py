@@ -58,6 +58,10 @@ TURN = 0.05  # s, the longest sleep of the loop
 RESEND = 2.0  # s between two sendings of an end that is not acknowledged
 TAKEOVER = 5.0  # s that another process may still have the bus
 PATIENCE = 5.0  # s that a command waits for the loop
+UNASKED = (
+    'control.gate is "operator": whoever stands at the robot has to agree to each script; '
+    '--auto needs gate = "auto"'
+)
 CONFIRMED = 1.5  # s in which all servos should have said that they are limp
 MOVING = ("enable", "arm", "pose", "play")  # commands that are not done once the robot was stopped
 
@@ -294,11 +298,14 @@ class Agent:
         return {"state": str(self._motion.state)}
 
     def _script(self, command: dict[str, Any], stopped: Callable[[], bool]) -> None:
-        """What the operator lets the robot play."""
+        """What the operator lets the robot play; whoever asks has to say that he did."""
+        if self._settings.control.gate == "operator" and command.get("agreed") is not True:
+            raise InputError(UNASKED)
         if command["do"] == "play":
             self._scripts.play(stopped)
         elif self._conductor.stage in (Stage.NONE, Stage.WAITING):
-            self._scripts.pose(command.get("script"), command.get("repeat_of"), stopped)
+            script, repeat_of = command.get("script"), command.get("repeat_of")
+            self._scripts.pose(script, repeat_of, command.get("setup", {}), stopped)
         else:
             raise InputError("a trial is under way")
 

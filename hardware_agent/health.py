@@ -60,6 +60,10 @@ def health(
             "joint": senses.names[hottest],
             "temperature": _number(float(senses.temperature[hottest])),
         }
+        told["position"] = {
+            name: _number(round(float(angle), 4))
+            for name, angle in zip(senses.names, senses.position, strict=True)
+        }
         if senses.imu is not None:
             told["tilt"] = {"roll": senses.imu.roll, "pitch": senses.imu.pitch}
     return told

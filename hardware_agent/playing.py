@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,9 @@ class _Ended(Exception):  # noqa: N818
     """The operator ends it: by leaving, or by a stop."""
 
 
-def play(socket: Path, files: Sequence[Path], repeats: int, auto: bool) -> int:
+def play(
+    socket: Path, files: Sequence[Path], repeats: int, auto: bool, setup: Mapping[str, float]
+) -> int:
     """Play scripts and tell where their recordings are.
 
     A robot that moves when the terminal is lost is stopped: nobody could any more.
@@ -30,7 +32,8 @@ def play(socket: Path, files: Sequence[Path], repeats: int, auto: bool) -> int:
       socket: of the agent.
       files: of the scripts.
       repeats: how often each is played.
-      auto: whether nobody is asked: for robots that are not there.
+      auto: whether nobody is asked: for robots that are not there; the agent refuses others.
+      setup: what was changed on the robot, by its knobs; kept with the recordings.
 
     Returns:
       0 where all were played or skipped, 1 where the operator ended it or one was stopped.
@@ -48,25 +51,28 @@ def play(socket: Path, files: Sequence[Path], repeats: int, auto: bool) -> int:
             for script in scripts:
                 first: str | None = None
                 for _ in range(repeats):
-                    first = _one(socket, script, first, auto) or first
+                    first = _one(socket, script, first, auto, setup) or first
         except _Ended as error:
             print(error, file=sys.stderr)
             return 1
     return 0
 
 
-def _one(socket: Path, script: Script, repeat_of: str | None, auto: bool) -> str | None:
+def _one(
+    socket: Path, script: Script, repeat_of: str | None, auto: bool, setup: Mapping[str, float]
+) -> str | None:
     """Play a script; the recording's id, None where it was skipped."""
     print(f"{script.id}: {script.motion}, {script.support}, {script.duration:.1f} s", flush=True)
     if not auto and not _agreed(socket, moved=False):
         return None
-    say(socket, {"do": "pose", "script": script.document(), "repeat_of": repeat_of})
+    wanted = {"script": script.document(), "repeat_of": repeat_of, "setup": dict(setup)}
+    say(socket, {"do": "pose", "agreed": not auto, **wanted})
     told = _until(socket, ("ready", ""), auto)
     if told["stage"] == "ready":
         if not auto and script.support == "ground":
             print(GROUND, flush=True)
             _agreed(socket, moved=True)
-        say(socket, {"do": "play"})
+        say(socket, {"do": "play", "agreed": not auto})
         told = _until(socket, ("",), auto)
     result = told["result"]
     if "recording" not in result:

@@ -6,8 +6,8 @@ ROBOTIS e-manual, MX-28 (Protocol 1.0), MX-28 (2.0), OP2 sub-controller.
 import math
 from dataclasses import dataclass
 
-TICK = 2 * math.pi / 4096  # rad
-CENTRE = 2048  # ticks at an angle of 0
+from hardware_agent.mounting import Mounting
+
 RPM = 2 * math.pi / 60  # rad/s
 
 Span = tuple[int, int]
@@ -16,7 +16,7 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Status:
-    """What a servo tells; None for what was not asked.
+    """What a servo tells of its joint; None for what was not asked.
 
     Attributes:
       position: rad.
@@ -73,32 +73,33 @@ class Registers:
     position: Span
     block: Span
 
-    def status(self, data: bytes, error: int, detailed: bool) -> Status:
+    def status(self, data: bytes, error: int, detailed: bool, mounting: Mounting) -> Status:
         """What a servo's answer says.
 
         Args:
           data: of `block`, or of `position`.
           error: byte of the status packet.
           detailed: which of them it is.
+          mounting: of the servo.
         """
         alarm = _alarm(self.protocol, error)
         if not detailed:
-            return Status(
-                angle(int.from_bytes(data, "little", signed=self.protocol == 2)), alarm=alarm
-            )
+            position = int.from_bytes(data, "little", signed=self.protocol == 2)
+            return Status(mounting.angle(position), alarm=alarm)
+        sign = mounting.sign
         if self.protocol == 1:
             return Status(
-                angle(_word(data, 0)),
-                _signed(_word(data, 2)) * 0.114 * RPM,
-                _signed(_word(data, 4)) / 1023,
+                mounting.angle(_word(data, 0)),
+                sign * _signed(_word(data, 2)) * 0.114 * RPM,
+                sign * _signed(_word(data, 4)) / 1023,
                 data[6] / 10,
                 float(data[7]),
                 alarm,
             )
         return Status(
-            angle(int.from_bytes(data[6:10], "little", signed=True)),
-            int.from_bytes(data[2:6], "little", signed=True) * 0.229 * RPM,
-            int.from_bytes(data[0:2], "little", signed=True) / 1000,
+            mounting.angle(int.from_bytes(data[6:10], "little", signed=True)),
+            sign * int.from_bytes(data[2:6], "little", signed=True) * 0.229 * RPM,
+            sign * int.from_bytes(data[0:2], "little", signed=True) / 1000,
             _word(data, 18) / 10,
             float(data[20]),
             alarm,
@@ -154,16 +155,6 @@ ALARMS = {0x01: "input voltage", 0x04: "overheating", 0x20: "overload"}
 """Bits of Protocol 1.0 that tell of the servo; the others tell of a packet."""
 HARDWARE = {0x01: "input voltage", 0x04: "overheating", 0x10: "electrical shock", 0x20: "overload"}
 """Bits of the register of Protocol 2.0; 0x08, the motor's encoder, is added by newer servos."""
-
-
-def angle(ticks: int) -> float:
-    """The angle of a joint, rad."""
-    return (ticks - CENTRE) * TICK
-
-
-def ticks(position: float) -> int:
-    """The goal nearest to an angle in rad."""
-    return min(4095, max(0, round(position / TICK) + CENTRE))
 
 
 def hardware_alarm(bits: int) -> str:

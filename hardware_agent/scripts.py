@@ -22,6 +22,8 @@ log = logging.getLogger("pup-agent")
 
 SLACK = 0.02
 """Rad (m) beyond a joint's range that a script may ask for; the limits hold it back there."""
+LARGEST = 1e300
+"""Of a number that becomes a float; JSON knows larger ones, and NaN."""
 
 
 class Stage(StrEnum):
@@ -49,6 +51,7 @@ class Scripts:
         self._script: Script | None = None
         self._stage = Stage.NONE
         self._repeat_of: str | None = None
+        self._setup: dict[str, float] = {}
         self._result: dict[str, str] = {}
 
     @property
@@ -57,12 +60,15 @@ class Scripts:
         name = None if self._script is None else self._script.name
         return {"name": name, "stage": str(self._stage), "result": self._result}
 
-    def pose(self, told: object, repeat_of: object, stopped: Callable[[], bool]) -> None:
+    def pose(
+        self, told: object, repeat_of: object, setup: object, stopped: Callable[[], bool]
+    ) -> None:
         """Let the robot go to a script's first pose.
 
         Args:
           told: the script, as JSON values.
           repeat_of: id of the recording that this one shall repeat, None for the first.
+          setup: what was changed on the robot, by its knobs, as JSON values.
           stopped: whether somebody has stopped the robot since this was asked for.
 
         Raises:
@@ -73,11 +79,13 @@ class Scripts:
         first = script.name if repeat_of is None else repeat_of
         if not isinstance(first, str) or not first.startswith(script.name):
             raise InputError(f"{repeat_of!r} is no recording of {script.name}")
+        changed = self._changed(setup)
         self._repeat_of = None if repeat_of is None else first
         refused = self._motion.pose(script, stopped)
         if refused is not None:
             raise InputError(refused.reason)
         self._script, self._stage, self._result = script, Stage.POSING, {}
+        self._setup = changed
 
     def _check(self, script: Script) -> None:
         robot = self._robot
@@ -89,6 +97,18 @@ class Scripts:
         if beyond.any():
             joint = script.joints[int(np.argmax(beyond))]
             raise InputError(f"{script.id}: moves {joint} beyond its range; are these radians?")
+
+    def _changed(self, told: object) -> dict[str, float]:
+        """What was changed on the robot, where its knobs know it."""
+        if not isinstance(told, dict):
+            raise InputError("setup: is no object of knobs and numbers")
+        for knob, value in told.items():
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not abs(value) <= LARGEST:
+                raise InputError(f"setup: {knob!r} is {brief(repr(value))}; use a finite number")
+        setup = {knob: float(value) for knob, value in told.items()}
+        self._robot.setup(setup)
+        return setup
 
     def play(self, stopped: Callable[[], bool]) -> None:
         """Play it.
@@ -125,6 +145,7 @@ class Scripts:
                 support=script.support,
                 source=self._source,
                 **columns_of(rows, script.joints),
+                setup=self._setup,
                 repeat_of=self._repeat_of,
                 notes="played by pup-agent",
             )

@@ -17,8 +17,9 @@ from hardware_agent.config import SafetySettings
 from hardware_agent.imu import Board, Orientation
 from hardware_agent.limits import Applied, Limiter
 from hardware_agent.metronome import Metronome
+from hardware_agent.mounting import Mounting
 from hardware_agent.plausible import Plausible
-from hardware_agent.registers import REGISTERS, angle, ticks
+from hardware_agent.registers import REGISTERS
 from hardware_agent.safety import Guard
 from hardware_agent.senses import Response, Senses, Trip
 from hardware_agent.warmth import Warmth
@@ -288,13 +289,8 @@ def test_a_pose_beyond_the_range_may_stay_and_goes_no_further() -> None:
     assert limiter.within(outside) == pytest.approx(np.ones(3))
 
 
-@given(st.integers(0, 4095))
-def test_ticks_and_angles_are_each_others_inverse(tick: int) -> None:
-    assert ticks(angle(tick)) == tick
-
-
 def test_the_blocks_of_both_protocols_are_read_alike() -> None:
-    one = REGISTERS[1].status(bytes([0, 8, 100, 4, 50, 0, 118, 45]), 0x24, True)
+    one = REGISTERS[1].status(bytes([0, 8, 100, 4, 50, 0, 118, 45]), 0x24, True, Mounting())
     assert (one.position, one.voltage, one.temperature) == (0.0, 11.8, 45.0)
     assert one.velocity == pytest.approx(-100 * 0.114 * 2 * math.pi / 60)
     assert one.load == pytest.approx(50 / 1023) and one.alarm == "overheating, overload"
@@ -303,7 +299,7 @@ def test_the_blocks_of_both_protocols_are_read_alike() -> None:
     block[2:6] = (-50).to_bytes(4, "little", signed=True)
     block[6:10] = (2048).to_bytes(4, "little")
     block[18:20], block[20] = (118).to_bytes(2, "little"), 45
-    two = REGISTERS[2].status(bytes(block), 0x80, True)
+    two = REGISTERS[2].status(bytes(block), 0x80, True, Mounting())
     assert (two.position, two.voltage, two.temperature, two.load) == (0.0, 11.8, 45.0, -0.2)
     assert two.velocity == pytest.approx(-50 * 0.229 * 2 * math.pi / 60)
     assert two.alarm == "hardware error"

@@ -65,8 +65,9 @@ def test_a_script_is_played_recorded_and_repeated(
         with pytest.raises(InputError, match="enable it first"):
             made.say("pose", script=script.document())
         made.say("enable")
+        changed = ("--setup", "payload=0.5", "--setup", "p_gain=24")
         done = subprocess.run(
-            command(made, file, "--auto", "--repeats", 2), capture_output=True, text=True
+            command(made, file, "--auto", "--repeats", 2, *changed), capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
         assert made.health()["state"] == "enabled"
@@ -78,6 +79,8 @@ def test_a_script_is_played_recorded_and_repeated(
     for recording in (first, again):
         assert (recording.motion, recording.support) == ("step", "suspended")
         assert recording.source == "simulation"
+        assert recording.setup == {"payload": 0.5, "p_gain": 24.0}
+        recording.validate(OP2)
         assert recording.time[0] == 0 and recording.time[-1] >= script.duration - 1 / 33
         told = np.array([script.at(t) for t in recording.time])
         np.testing.assert_allclose(recording.target, told, atol=1e-9)
@@ -86,10 +89,74 @@ def test_a_script_is_played_recorded_and_repeated(
     check_contract(files[0].parent)
 
 
+def test_nothing_moves_without_asking_where_the_gate_is_the_operators(tmp_path: Path) -> None:
+    """The agent itself refuses, whoever asks: a command that tells of no agreement has none."""
+    (file,) = written(tmp_path, "step:0.1")
+    script = Script.read(file).document()
+    with lab(tmp_path, speed=0.0, more='[control]\ngate = "operator"\n') as made:
+        made.side(cmd="reset", hold="rope")
+        made.start()
+        made.say("enable")
+        before = made.health()["position"]
+        done = subprocess.run(command(made, file, "--auto"), capture_output=True, text=True)
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+        assert '--auto needs gate = "auto"' in done.stderr
+        for agreed in ({}, {"agreed": False}, {"agreed": 1}, {"agreed": "yes"}):
+            for do in ("pose", "play"):
+                with pytest.raises(InputError, match="has to agree"):
+                    made.say(do, script=script, **agreed)
+        assert made.health()["script"] == {"name": None, "stage": "", "result": {}}
+        assert made.health()["position"] == pytest.approx(before, abs=0.1)  # it hangs
+        made.say("pose", script=script, agreed=True)
+        wait(lambda: made.health()["script"]["stage"] == "ready", 60, made.log)
+        with pytest.raises(InputError, match="has to agree"):
+            made.say("play")
+        made.say("play", agreed=True)
+        wait(lambda: made.health()["script"]["stage"] == "", 120, made.log)
+        assert "recording" in made.health()["script"]["result"]
+
+
+SETUPS = {
+    "no knob": ({"payload": 0.1, "wind": 3.0}, "knobs: payload, supply_voltage, p_gain"),
+    "beyond its limits": ({"payload": 9.0}, "payload = 9 kg is outside"),
+    "a text": ({"payload": "0.5"}, "use a finite number"),
+    "true": ({"payload": True}, "use a finite number"),
+    "no number": ({"payload": float("nan")}, "use a finite number"),
+    "infinite": ({"payload": float("inf")}, "use a finite number"),
+    "beyond any float": ({"payload": 10**400}, "use a finite number"),
+    "a list": (["payload"], "no object of knobs"),
+    "null": (None, "no object of knobs"),
+}
+
+
+def test_a_setup_that_the_robot_does_not_have_is_refused(tmp_path: Path) -> None:
+    (file,) = written(tmp_path, "step:0.1")
+    with lab(tmp_path, speed=0.0) as made:
+        made.side(cmd="reset", hold="rope")
+        made.start()
+        for setup, told in SETUPS.values():
+            with pytest.raises(InputError, match=told):
+                made.say("pose", script=Script.read(file).document(), setup=setup)
+        for words, expected in (
+            (("wind=3", "payload=0.1"), "is no knob of robot"),
+            (("payload",), "--setup: 'payload' is not KNOB=NUMBER"),
+            (("payload=much",), "is not KNOB=NUMBER"),
+            (("payload=nan",), "is not KNOB=NUMBER"),
+            (("=1",), "is not KNOB=NUMBER"),
+            (("payload=0.1", "payload=0.2"), "payload is told twice"),
+        ):
+            done = subprocess.run(
+                command(made, file, "--auto", "--setup", *words), capture_output=True, text=True
+            )
+            assert done.returncode == 2, done.stderr
+            assert expected in done.stderr and len(done.stderr.splitlines()) == 1
+        assert made.health()["script"]["stage"] == ""
+
+
 @pytest.mark.slow
 def test_any_key_stops_a_script_and_nothing_is_recorded(tmp_path: Path) -> None:
     step, hold = written(tmp_path, "step:0.1", "hold")
-    with lab(tmp_path, speed=1.0) as made:
+    with lab(tmp_path, speed=1.0, more='[control]\ngate = "operator"\n') as made:
         made.side(cmd="reset", hold="rope")
         made.start()
         made.say("enable")
