@@ -256,6 +256,39 @@ def test_report_of_nothing_missing(bench: Maker, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_parts_of_one_recording_are_told_as_that_recording(bench: Maker, tmp_path: Path) -> None:
+    """Times count from where the recording begins, not the part; slides are off by micrometres."""
+    found = bench.missing("backlash", Place("joint", "servo"), gap=0.008)
+    parts = [r.id for r in found.measured.recordings]
+    begins = {id: ("long", 4.0 * number) for number, id in enumerate(parts)}
+    whole = replace(found, origins=begins)
+    told, before = document(whole, "corrected"), document(found, "corrected")
+    for one, other in zip(told["findings"][0]["when"], before["findings"][0]["when"], strict=True):
+        begin = begins[other["recording"]][1]
+        assert one == {
+            "recording": "long",
+            "start": begin + other["start"],
+            "end": begin + other["end"],
+        }
+    assert told["held_out"]["recordings"] == ["long"]
+    shown = page(whole, tmp_path)
+    assert f"from one recording, in {len(parts)} parts between its rests" in shown.text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_effects_that_do_not_matter_are_those_that_were_left_last(
+    bench: Maker, tmp_path: Path
+) -> None:
+    """Not those that rounds added and others took the place of."""
+    found = bench.missing("backlash", Place("joint", "servo"), gap=0.008)
+    assert found.model is not None
+    small = replace(bench.nothing(), rounds=found.rounds, slight=found.model.hypotheses)
+    assert "but too little to matter" in page(small, tmp_path).text
+    none = replace(small, slight=())
+    assert "but too little to matter" not in page(none, tmp_path).text
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_assumed_noise_is_admitted(bench: Maker, tmp_path: Path) -> None:
     diagnosis = bench.nothing()
     noise = replace(diagnosis.noise, source="assumed")

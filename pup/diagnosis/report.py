@@ -30,7 +30,7 @@ from pup.files import write_atomic
 from pup.sysid.accuracy import JointUnits
 from pup.sysid.figures import drawing_style
 from pup.sysid.html import Column, Html, figure, join, page, table, tag
-from pup.sysid.wording import counted, flattened, listed, recordings_words
+from pup.sysid.wording import counted, flattened, listed, recordings_words, thousandths
 
 SURE = 0.7
 """A finding less probable than this is told as the likeliest of several."""
@@ -104,7 +104,10 @@ class _Report:
     def headline(self) -> Iterator[Html]:
         """The verdict in plain words."""
         diagnosis = self.diagnosis
-        count = recordings_words(diagnosis.measured.recordings)
+        parts = diagnosis.measured.recordings
+        count = recordings_words(parts)
+        if diagnosis.origins:
+            count = f"one recording, in {counted(len(parts), 'part')} between its rests"
         yield tag("p", f"Diagnosis of {diagnosis.robot.name}, from {count}", class_="lead")
         yield tag("h1", self.title())
         if len(self.items) > 1:
@@ -248,16 +251,16 @@ class _Report:
         held = diagnosis.held_out
         if held is not None:
             mended = summary.corrected(diagnosis)
-            after = f" → {1000 * held.after:.1f}" if mended else ""
+            after = f" → {thousandths(held.after)}" if mended else ""
             yield (
                 "Error on motions left out",
-                f"{1000 * held.before:.1f}{after} {units.small}",
+                f"{thousandths(held.before)}{after} {units.small}",
                 "nominal → corrected model" if after else "nominal model, refitted",
             )
         source = "measured from repeats" if diagnosis.noise.source == "repeats" else "assumed"
         yield (
             "Noise of a reading",
-            f"{1000 * summary.joint_noise(diagnosis):.1f} {units.small}",
+            f"{thousandths(summary.joint_noise(diagnosis))} {units.small}",
             source,
         )
         if np.isfinite(self.left()):
