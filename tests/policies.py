@@ -21,6 +21,11 @@ COURSE = 2
 SIZES = len(OBSERVATION), len(PARAMETERS), COURSE + len(PARAMETERS), len(ROBOT.joints)
 
 
+def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    """Whether two sets of weights are equal to the last bit."""
+    return one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+
+
 def policy_of(method: Method = Method.PUP, seed: int = 0) -> ProjectedPolicy:
     """A policy as after some training: with statistics, and actions that are not all alike."""
     torch.manual_seed(seed)

@@ -16,6 +16,7 @@ pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 
 import torch
+from policies import same
 from ray.rllib.core import DEFAULT_MODULE_ID
 
 from pup.policy.losses import Samples
@@ -164,10 +165,6 @@ def test_a_runner_that_was_lost_leaves_the_others_their_states() -> None:
 
 
 # --- On a real Ray --------------------------------------------------------------------------------
-
-
-def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
 
 
 def weights_after(setup: Setup, iterations: int) -> dict[str, np.ndarray]:

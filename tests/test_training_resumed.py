@@ -12,6 +12,8 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("gymnasium")
 
+from policies import same
+
 from pup.errors import InputError
 from pup.locomotion.settings import Direction
 from pup.physics.parameters import robot_space
@@ -44,10 +46,6 @@ def job(out: Path, options: Options = SMALL, told=lambda row, steps: None):
 def weights_of(out: Path) -> dict[str, np.ndarray]:
     with np.load(out / "policy" / "weights.npz", allow_pickle=False) as packed:
         return {name: packed[name] for name in packed.files}
-
-
-def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
 
 
 def test_runners_that_do_not_come_back_are_told(

@@ -8,7 +8,7 @@ torso leans one way alone, what it calls -roll and, by Android's convention, pit
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_agent.virtual.imu import conjugate, multiply
+from hardware_agent.virtual.imu import conjugate, multiply, roll_pitch_yaw
 from hardware_agent.virtual.plant import Plant
 
 Array = NDArray[np.float64]
@@ -156,7 +156,7 @@ def angles(turn: Array, android: bool) -> Array:
       turn: from the chip to the world, a quaternion.
       android: whether the unit register says Android, not Windows.
     """
-    about_x, about_y, about_z = _turns(turn)
+    about_x, about_y, about_z = roll_pitch_yaw(turn)
     pitch = -about_x if android else about_x
     return np.array([-about_z % (2 * np.pi), -about_y, pitch])
 
@@ -168,18 +168,8 @@ def lean(turn: Array) -> tuple[float, float]:
       turn: from the torso to the world, a quaternion.
     """
     told = multiply(np.rint(multiply(turn, LYING) * UNIT), conjugate(LYING))
-    roll, pitch, _ = _turns(told / np.linalg.norm(told))
+    roll, pitch, _ = roll_pitch_yaw(told / np.linalg.norm(told))
     return roll, pitch
-
-
-def _turns(turn: Array) -> tuple[float, float, float]:
-    """Turns about x, y and z (Z-Y-X Euler angles) of a quaternion, rad."""
-    w, x, y, z = turn
-    return (
-        float(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
-        float(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))),
-        float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
-    )
 
 
 def _lying(vector: Array) -> Array:

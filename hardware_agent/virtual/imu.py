@@ -127,6 +127,16 @@ def conjugate(turn: Array) -> Array:
     return np.asarray(turn * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
+def roll_pitch_yaw(turn: Array) -> tuple[float, float, float]:
+    """Turns about x, y and z (Z-Y-X Euler angles) of a quaternion, rad."""
+    w, x, y, z = turn
+    return (
+        float(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+        float(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))),
+        float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
+    )
+
+
 def rotate(turn: Array, vector: Array) -> Array:
     """A vector turned."""
     return multiply(multiply(turn, np.array([0.0, *vector])), conjugate(turn))[1:]

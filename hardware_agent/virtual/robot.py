@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hardware_agent.virtual.bno055 import Bno055
 from hardware_agent.virtual.board import Board
 from hardware_agent.virtual.bus import Bus
+from hardware_agent.virtual.imu import roll_pitch_yaw
 from hardware_agent.virtual.plant import Hold, Plant
 from hardware_agent.virtual.servo import Servo, Servo1, Servo2
 from hardware_agent.virtual.skeleton import STEP
@@ -92,7 +93,7 @@ class VirtualRobot:
         self.plant.place([0], hold)
         if self.robot.floating:
             x, y, *_ = map(float, self.plant.qpos[0, :2])
-            self._put_down = x, y, _tilt(self.plant.qpos[0, 3:7])[2]
+            self._put_down = x, y, roll_pitch_yaw(self.plant.qpos[0, 3:7])[2]
 
     def release(self) -> None:
         """Let go."""
@@ -141,14 +142,5 @@ class VirtualRobot:
         x_then, y_then, yaw = self._put_down
         way, ahead = np.array([x - x_then, y - y_then]), np.array([np.cos(yaw), np.sin(yaw)])
         forward, left = float(way @ ahead), float(way @ np.array([-ahead[1], ahead[0]]))
-        return Pose(self.time, (x, y, z), _tilt(self.plant.qpos[0, 3:7]), forward, left, held)
-
-
-def _tilt(turn: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a quaternion, rad."""
-    w, x, y, z = turn
-    return (
-        float(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
-        float(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))),
-        float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
-    )
+        tilt = roll_pitch_yaw(self.plant.qpos[0, 3:7])
+        return Pose(self.time, (x, y, z), tilt, forward, left, held)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.residuals import Measured
+from pup.diagnosis.signals import command_at
 from pup.physics.terms.scale import Scale
 
 Array = NDArray[np.float64]
@@ -53,20 +54,15 @@ def regimes(measured: Measured, simulated: Array, limits: Array, gains: Array) -
     age, reversal = np.full(len(simulated), np.inf), np.zeros(len(simulated), dtype=bool)
     torque, limit = np.zeros(len(simulated)), np.full(len(simulated), np.inf)
     for number, recording in enumerate(measured.recordings):
-        elapsed = recording.time - recording.time[0]
         for joint, name in enumerate(measured.robot.joint_names):
             run = np.flatnonzero((measured.recording == number) & (measured.channel == joint))
             if len(run) < 5:
                 continue
             time = measured.time[run]
             speed[run] = np.gradient(simulated[run], time)
-            column = recording.target[:, recording.joints.index(name)]
-            rows = np.clip(np.searchsorted(elapsed, time, "right") - 1, 0, len(elapsed) - 1)
-            error[run] = np.nan_to_num(column[rows] - simulated[run])
+            command, age[run] = command_at(recording, name, time)
+            error[run] = np.nan_to_num(command - simulated[run])
             torque[run], limit[run] = np.abs(gains[joint] * error[run]), limits[joint]
-            moved = np.r_[False, np.nan_to_num(np.diff(column)) != 0]
-            last = np.maximum.accumulate(np.where(moved, elapsed, -np.inf))
-            age[run] = time - last[rows]
             turns = time[1:][np.diff(np.sign(speed[run])) != 0]
             if len(turns):
                 near = turns[np.clip(np.searchsorted(turns, time), 0, len(turns) - 1)]

@@ -84,12 +84,14 @@ def signals(
     speed = np.gradient(path, read)
     when = read if time is None else time
     position, velocity = np.interp(when, read, path), np.interp(when, read, speed)
-    target, age = _command(measured.recordings[recording], measured.robot.joint_names[joint], when)
+    target, age = command_at(
+        measured.recordings[recording], measured.robot.joint_names[joint], when
+    )
     error = target - position
     return Signals(when, position, velocity, error, servo.torque(error, velocity), age)
 
 
-def _command(recording: Recording, joint: str, time: Array) -> tuple[Array, Array]:
+def command_at(recording: Recording, joint: str, time: Array) -> tuple[Array, Array]:
     """The command held at some times, and its age."""
     elapsed = recording.time - recording.time[0]
     held = recording.target[:, recording.joints.index(joint)]
