@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ Array = NDArray[np.float64]
 
 TILT = 1.0  # rad, of a robot without a gait
 SILENT = 1.0  # s, after which an IMU is set up anew while the robot is limp
+MISSED = 0.01  # rad of a joint's range that nobody misses
 DOUBT = 2.0  # s, from which on a servo that does not say that it is limp is a problem
 
 
@@ -45,14 +45,25 @@ class Body:
             raise InputError(f"{robot.folder / 'robot.toml'}: joint {lacking!r} has no servo_id")
         self.ids = [number for number in ids if number is not None]
         self.imu = imu_of(settings.imu)
+        self._robot = robot
         mountings = _mountings(settings.bus, robot)
         senses = settings.imu.kind == "cm740"
         self.bus = Bus(settings.bus, self.ids, senses, mountings)
         self.guard = Guard(settings.safety, robot.gait.tilt_limit if robot.gait else TILT)
-        self.limiter = Limiter(self.names, *_reached(robot, mountings), settings.safety)
+        self._limit()
         self.torque = self.ready = False
         self.repeated = self.lost = 0
         self._forget()
+
+    def _limit(self) -> list[str]:
+        """Keep targets where the servos take them; tells of joints that these hold back."""
+        reach, (lower, upper) = self.bus.reach, self._robot.limits
+        self.limiter = Limiter(self.names, *_reached(self._robot, reach), self.settings.safety)
+        return [
+            f"servo {self.ids[j]} takes {self.names[j]} from {low:.2f} to {high:.2f} rad only"
+            for j, (low, high) in enumerate(reach)
+            if low > lower[j] + MISSED or high < upper[j] - MISSED
+        ]
 
     def _forget(self) -> None:
         n = len(self.names)
@@ -76,20 +87,22 @@ class Body:
         """Take the bus and the IMU; the servos are limp afterwards.
 
         Returns:
-          What was put right in the servos.
+          What was put right in the servos, and how far they go where that is not all of a
+          joint's range.
 
         Raises:
           BusError: something does not answer.
-          InputError: something else is there than was configured.
+          InputError: something else is there than was configured, or a servo does not take its
+            joint's angles.
         """
         self.torque = self.ready = False
         self._forget()
-        put_right = self.bus.open()
+        told = self.bus.open() + self._limit()
         if self.imu is not None:
             self.imu.close()
             self.imu.open()
         self.ready = True
-        return put_right
+        return told
 
     def close(self) -> None:
         """Give everything up, limp."""
@@ -286,12 +299,11 @@ def _mountings(settings: BusSettings, robot: RobotDescription) -> list[Mounting]
     return [settings.joints.get(name, Mounting()) for name in robot.joint_names]
 
 
-def _reached(robot: RobotDescription, mountings: Sequence[Mounting]) -> tuple[Array, Array]:
+def _reached(robot: RobotDescription, reach: Array) -> tuple[Array, Array]:
     """The joints' ranges as far as their servos reach, rad.
 
     A target beyond that is held back here already: so the recording tells what the servo was told.
     """
-    reach = np.array([mounting.reach for mounting in mountings])
     lower, upper = robot.limits
     least, largest = np.maximum(lower, reach[:, 0]), np.minimum(upper, reach[:, 1])
     for j in np.flatnonzero(least >= largest):

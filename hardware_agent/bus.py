@@ -22,6 +22,7 @@ from hardware_agent.port import FAILURES, BusError, Port, device_error
 from hardware_agent.registers import (
     BOARD_POWER,
     BOARD_SENSES,
+    POSITION,
     REGISTERS,
     Span,
     Status,
@@ -76,6 +77,7 @@ class Bus:
         self.ids = tuple(ids)
         told = [Mounting()] * len(self.ids) if mountings is None else mountings
         self._mountings = dict(zip(self.ids, told, strict=True))
+        self._reach = {name: mounting.reach for name, mounting in self._mountings.items()}
         self.registers = REGISTERS[settings.protocol]
         self._senses = senses
         self._port = Port(settings.port, settings.baud, settings.timeout)
@@ -90,7 +92,8 @@ class Bus:
           What was put right, in words.
 
         Raises:
-          BusError: a servo does not answer or is of another kind.
+          BusError: a servo does not answer.
+          InputError: one is of another model, or does not hold angles.
           BusyError: another program owns the bus.
         """
         self._port.close()
@@ -104,6 +107,14 @@ class Bus:
                 told = ", ".join(map(str, missing))
                 raise BusError(f"{self.settings.port}: no answer from servo {told}")
             return [told for name in self.ids for told in self._set_up(name)]
+
+    @property
+    def reach(self) -> Array:
+        """Least and largest angle that each servo takes as a goal, rad, shape (n_servos, 2).
+
+        Once opened, within the limits that it holds itself.
+        """
+        return np.array([self._reach[name] for name in self.ids])
 
     def attach(self) -> None:
         """Open the port without taking the bus: for who may have to take it over.
@@ -338,6 +349,7 @@ class Bus:
                 f"{self.settings.port}: servo {name} is of model {model}, not an MX-28 with "
                 f"Protocol {own.protocol}.0 (model {own.model}); see [bus] protocol"
             )
+        self._reach[name] = self._own_limits(name)
         for told, span, wanted in (
             ("return delay", own.return_delay, 0),
             ("status return level", own.status_level, 2),
@@ -348,6 +360,25 @@ class Bus:
                 if self._register(name, span) != wanted:
                     raise BusError(f"{self.settings.port}: servo {name} keeps {told} {known}")
                 yield f"servo {name}: {told} {known} made {wanted}"
+
+    def _own_limits(self, name: int) -> tuple[float, float]:
+        """Between which angles a servo takes goals, rad; beyond them it stays where it is."""
+        own, where = self.registers, f"{self.settings.port}: servo {name}"
+        mode = POSITION if own.mode is None else self._register(name, own.mode)
+        least, largest = (self._register(name, span) for span in own.limits)
+        if mode is None or least is None or largest is None:
+            raise BusError(f"{where} does not tell its mode and limits")
+        if mode != POSITION:
+            raise InputError(
+                f"{where} is in operating mode {mode} and takes no angles; set mode {POSITION}, "
+                "position control, with ROBOTIS' tools"
+            )
+        if least >= largest:  # both 0 are wheel mode, both 4095 several turns
+            raise InputError(
+                f"{where} takes no angles, as its angle limits are {least} and {largest}; set "
+                "joint mode, such as limits 0 and 4095, with ROBOTIS' tools"
+            )
+        return self._mountings[name].span(least, largest)
 
     def _register(self, name: int, span: Span) -> int | None:
         """A register of one servo; None when it does not answer, however often it is asked."""

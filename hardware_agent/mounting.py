@@ -31,5 +31,9 @@ class Mounting:
     @property
     def reach(self) -> tuple[float, float]:
         """Least and largest angle that the servo can be told, rad."""
-        ends = sorted((self.angle(0), self.angle(LAST)))
+        return self.span(0, LAST)
+
+    def span(self, least: int, largest: int) -> tuple[float, float]:
+        """Least and largest angle between two ticks, rad."""
+        ends = sorted((self.angle(least), self.angle(largest)))
         return ends[0], ends[1]

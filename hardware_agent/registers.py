@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from hardware_agent.mounting import Mounting
 
 RPM = 2 * math.pi / 60  # rad/s
+POSITION = 3  # operating mode of Protocol 2.0 in which goals are angles within one turn
 
 Span = tuple[int, int]
 """Address and length."""
@@ -42,6 +43,8 @@ class Registers:
     Attributes:
       protocol: 1 or 2.
       model: number that its servos answer.
+      mode: EEPROM; POSITION holds angles; None where the limits tell the mode.
+      limits: EEPROM; least and largest goal, ticks.
       return_delay: EEPROM; 0 answers at once.
       status_level: which instructions are answered.
       torque_enable: 1 holds, 0 is limp.
@@ -59,6 +62,8 @@ class Registers:
 
     protocol: int
     model: int
+    mode: Span | None
+    limits: tuple[Span, Span]
     return_delay: Span
     status_level: Span
     torque_enable: Span
@@ -110,6 +115,8 @@ REGISTERS = {
     1: Registers(
         protocol=1,
         model=29,
+        mode=None,
+        limits=((6, 2), (8, 2)),
         return_delay=(5, 1),
         status_level=(16, 1),
         torque_enable=(24, 1),
@@ -127,6 +134,8 @@ REGISTERS = {
     2: Registers(
         protocol=2,
         model=30,
+        mode=(11, 1),
+        limits=((52, 4), (48, 4)),
         return_delay=(9, 1),
         status_level=(68, 1),
         torque_enable=(64, 1),

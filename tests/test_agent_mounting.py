@@ -240,3 +240,43 @@ def test_what_a_servo_does_not_reach_is_held_back(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"joints.l_knee: the servo reaches 0.00 to 6.28 rad only"):
         Body(Settings.read(file), DARWIN)
     assert math.isclose(Mounting(-1, 0).reach[0], -LAST * TICK)
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_limits_that_a_servo_holds_itself_hold_targets_back(tmp_path: Path, protocol: int) -> None:
+    """Else the servo would stay where it is, and the recording tell a goal that it never had."""
+    least, largest = (
+        ("cw_angle_limit", "ccw_angle_limit") if protocol == 1 else ("min_position", "max_position")
+    )
+    with robot_with(tmp_path, FACTORY, protocol) as robot:
+        file = tmp_path / "agent.toml"
+        file.write_text(CONFIG.format(folder=tmp_path, protocol=protocol, clock="lockstep"))
+        body = Body(Settings.read(file), DARWIN)
+        robot.servos[HEAD].memory.put(largest, 2048 + 200)
+        told = [line for line in body.open() if "only" in line]
+        limit = 200 * TICK
+        assert told == [f"servo {IDS[HEAD]} takes head_tilt from -3.14 to {limit:.2f} rad only"]
+        assert DARWIN.limits[1][HEAD] > limit
+        assert body.limiter.within(np.full(N, 9.0))[HEAD] == pytest.approx(limit)
+        body.close()
+        robot.servos[HEAD].memory.put(least, 2048 + 199)
+        robot.servos[HEAD].memory.put(largest, 2048 - 199)
+        with pytest.raises(InputError, match=f"servo {IDS[HEAD]} takes no angles, as its angle"):
+            body.open()
+        body.close()
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_a_servo_in_another_mode_is_refused(tmp_path: Path, protocol: int) -> None:
+    with robot_with(tmp_path, FACTORY, protocol) as robot:
+        memory = robot.servos[HEAD].memory
+        if protocol == 1:
+            memory.put("ccw_angle_limit", 0)  # of the wheel mode, with the other limit at 0
+        else:
+            memory.put("operating_mode", 4)
+        port = str(tmp_path / "bus")
+        bus = Bus(BusSettings(port, protocol=protocol, board=200, timeout=0.3), IDS)
+        told = "limits are 0 and 0; set joint mode" if protocol == 1 else "mode 4 and takes no angl"
+        with pytest.raises(InputError, match=f"{port}: servo {IDS[HEAD]} .*{told}"):
+            bus.open()
+        bus.close()
