@@ -4,6 +4,7 @@ import pytest
 
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.residuals import Measured
+from pup.recording import load_recordings
 from pup.robot import RobotDescription
 from tests.diagnoses import MOTIONS, recordings
 
@@ -32,3 +33,14 @@ def test_a_force_from_outside_is_looked_for_where_several_joints_feel_it(
     assert {h.place.name for h in told if h.effect == "external_force"} == bodies
     loads = {h.place.name for h in told if h.effect == "payload"}
     assert bodies < loads  # any link may carry something
+
+
+@pytest.mark.parametrize("hanging", [(), ("step_0.1_0",)])
+def test_a_free_torso_is_pushed_and_links_where_some_motions_hang(hanging: tuple[str, ...]) -> None:
+    robot = RobotDescription.load("darwin_op2")
+    shipped = [robot.folder / "recordings" / f"{n}.parquet" for n in ("standup_2", *hanging)]
+    told = hypotheses(Measured.of(robot, load_recordings(shipped)))
+    pushed = [h.place.name for h in told if h.effect == "external_force"]
+    assert len(set(pushed)) == len(pushed)
+    assert robot.torso in pushed
+    assert ("l_knee_link" in pushed) == bool(hanging)

@@ -59,3 +59,19 @@ def test_why_it_does_not_matter_is_told() -> None:
     assert "below 0.25 of its typical size" in little(found, shown(0.2))
     assert "hardly changes what is predicted" in little(found, shown(-0.1))
     assert little(model(None, 1.0), shown(0.0)) == ""
+
+
+@pytest.mark.parametrize(
+    ("joints", "torso", "told"),
+    [
+        ((1.0, 0.9), (1.0, 1.2), True),
+        ((1.0, 1.0), (1.0, 0.9), True),  # such as an IMU that tells late
+        ((1.0, 1.0), (1.0, 1.0), False),
+        ((1.0, 1.1), (1.0, 0.1), False),
+    ],
+)
+def test_better_are_joints_or_else_the_torso(
+    joints: tuple[float, float], torso: tuple[float, float], told: bool
+) -> None:
+    held = HeldOut(("a",), *joints, (0.0, 0.0), per_tilt={"roll": (0.1, 0.1), "pitch": torso})
+    assert held.better is told

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pup.diagnosis.falls import DOWN, TOPPLES, standing
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.noise import noise_floor, quiet_noise
 from pup.diagnosis.replays import Bench, Replays, threads, union
-from pup.diagnosis.residuals import FLAT, Measured
+from pup.diagnosis.residuals import FLAT, TILTS, Measured
 from pup.physics.parameters import robot_space
 from pup.physics.terms import Place, column
 from pup.recording import Recording, load_recordings
@@ -55,12 +56,28 @@ def test_a_turn_more_or_less_of_the_torso_is_the_same(shipped: dict[str, Recordi
 def test_who_lies_on_its_face_tells_no_roll(shipped: dict[str, Recording]) -> None:
     run = shipped["fall_left"]
     ticks = len(run.time)
-    pitch = np.where(np.arange(ticks) < ticks // 2, 0.0, FLAT + 0.1)
-    lying = Measured.of(OP2, [replace(run, extras={**run.extras, "imu/pitch": pitch})])
+    pitch = np.where(np.arange(ticks) < ticks // 2, FLAT + 0.1, 0.0)
+    level = {**run.extras, "imu/roll": np.zeros(ticks), "imu/pitch": pitch}
+    lying = Measured.of(OP2, [replace(run, extras=level)])
     half = run.time[ticks // 2] - run.time[0]
     roll, tilt = len(OP2.joints), len(OP2.joints) + 1
-    assert lying.time[lying.channel == roll].max() < half
-    assert lying.time[lying.channel == tilt].max() > half
+    assert lying.time[lying.channel == roll].min() >= half
+    assert lying.time[lying.channel == tilt].min() < half
+
+
+def test_what_follows_a_fall_tells_nothing(shipped: dict[str, Recording]) -> None:
+    """Where it comes to lie, a hair of a difference decides."""
+    run = shipped["fall_left"]
+    lean = np.maximum(*(np.abs(run.extras[f"imu/{a}"]) for a in TILTS))
+    assert lean[0] < TOPPLES and lean.max() > DOWN
+    (cut,) = Measured.of(OP2, [run]).recordings
+    assert cut.id == run.id and 2 < len(cut.time) < len(run.time)
+    assert lean[: len(cut.time)].max() < TOPPLES <= lean[len(cut.time)]
+    leans = replace(run, extras={**run.extras, "imu/roll": 0.9 * run.extras["imu/roll"] / lean})
+    lies = {f"imu/{a}": np.full(len(run.time), v) for a, v in zip(TILTS, (0.1, 1.5), strict=True)}
+    hangs = replace(run, support="suspended")
+    for other in (shipped["standup_2"], leans, replace(run, extras=lies), hangs):
+        assert standing(other) is other
 
 
 def test_commands_that_stand_only_where_they_change_are_the_same_commands() -> None:

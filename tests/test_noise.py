@@ -8,6 +8,7 @@ import pytest
 
 from pup.diagnosis.noise import noise_floor, quiet_noise
 from pup.diagnosis.residuals import Measured, Noise
+from pup.recording import load_recordings
 from pup.robot import RobotDescription
 from tests.diagnoses import Maker
 from tests.diagnosis_cases import BENCH, recordings
@@ -49,6 +50,18 @@ def test_a_noisier_joint_is_believed_and_a_quieter_one_by_half(joint: int) -> No
 
 def test_a_joint_that_hardly_says_anything_is_nearly_as_noisy_as_the_others() -> None:
     assert times_as_noisy(2, 4.0, readings=8) == pytest.approx(np.sqrt((16 + 1) / 2), rel=0.3)
+
+
+def test_tilts_flicker_where_only_what_hangs_was_done_again() -> None:
+    robot = RobotDescription.load("darwin_op2")
+    shipped = [robot.folder / "recordings" / f"{n}.parquet" for n in ("step_0.1_0", "standup_2")]
+    runs = load_recordings(shipped)
+    hanging, standing = sorted(runs, key=lambda run: run.support != "suspended")
+    again = replace(hanging, id="again", repeat_of=hanging.id)
+    measured = Measured.of(robot, [hanging, again, standing])
+    told = noise_floor(measured, errors(measured))
+    assert told.source == "repeats"
+    assert told.sigma == pytest.approx(SIGMA, rel=0.35)
 
 
 def times_as_noisy(joint: int, factor: float, readings: int = 1_000) -> float:

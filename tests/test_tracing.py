@@ -9,7 +9,7 @@ from pup.diagnosis.hypotheses import MODERATE, Hypothesis, hypotheses
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.tracing import traces
+from pup.diagnosis.tracing import by_rank, traces
 from pup.physics.parameters import robot_space
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
@@ -66,6 +66,18 @@ def test_joints_of_promising_groups_are_simulated_on_the_ground(
         if hypothesis.place.kind == "joint":  # there are fewer groups than are promising
             own = _simulated(hypothesis, base, replays)
             assert whole[ground] == pytest.approx(own[ground], rel=0.02, abs=0.02)
+
+
+def test_a_joint_that_was_not_simulated_is_as_promising_as_its_group(found: Found) -> None:
+    claims = {h.key: h for h in found if h.place.kind in ("joint", "group")}
+    groups = [h for h in claims.values() if h.place.kind == "group"]
+    alone = [h for h in claims.values() if h.place.kind == "joint"]
+    told = by_rank([*alone, *groups], {h.key: i for i, h in enumerate(groups)}, OP2)
+    for joint in alone:
+        above = [g for g in groups if set(joint.place.joints(OP2)) < set(g.place.joints(OP2))]
+        later = groups[groups.index(above[0]) + 1 :] if above else []
+        assert all(told.index(joint) < told.index(group) for group in later)
+    assert {h.key for h in told} == set(claims)
 
 
 def _simulated(hypothesis: Hypothesis, base: Fit, replays: Replays) -> np.ndarray:

@@ -16,8 +16,8 @@ from pup.physics.terms.scale import Scale
 MODERATE = 0.5
 """A hypothesis is first looked at in this share of its typical size."""
 FROM_OUTSIDE = frozenset(("external_force",))
-"""Effects of a wrench: on the torso where it is free, else on links. One joint alone cannot tell a
-force on its link from a centre of mass elsewhere."""
+"""Effects of a wrench: on the torso where it is free, on links where that is fixed. One joint alone
+cannot tell a force on its link from a centre of mass elsewhere."""
 
 EVERYWHERE = ("robot", "bus")
 """Kinds of places that all servos are at."""
@@ -185,15 +185,13 @@ def _bodies(effect: str, measured: Measured, ground: bool) -> Iterator[Place]:
     if effect == "structural_flex":
         yield from (Place("body", model.body(b).name) for b in dict.fromkeys(carried))
         return
-    if effect in FROM_OUTSIDE and ground:
-        if robot.torso:
-            yield Place("body", robot.torso)
-        return
-    least = 2 if effect in FROM_OUTSIDE else 1
+    outside = effect in FROM_OUTSIDE
+    least = 2 if outside else 1
     for body in range(1, model.nbody):
         joints = sum(_is_below(model.body_parentid, body, c) for c in carried)
         free = ground and model.body(body).name == robot.torso
-        if (joints >= least or free) and model.body_mass[body] > 0.01:
+        held = joints >= least and not (outside and supports == {"ground"})
+        if (held or free) and model.body_mass[body] > 0.01:
             yield Place("body", model.body(body).name)
 
 

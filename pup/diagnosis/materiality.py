@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.models import Model
-from pup.diagnosis.residuals import Noise
+from pup.diagnosis.residuals import TILTS, Noise
 from pup.diagnosis.verdict import SLIGHT, HeldOut
 
 Array = NDArray[np.float64]
 
 GAIN, FORESEEN = 0.3, 0.6
-"""Shares of a joint's noise by which its error falls, on what was fitted and on motions left out,
-where that matters whatever the size is. A nominal fit that makes up for something small on all
-motions may be led far astray by some of them, so that more is asked of the others."""
+"""Shares of a joint's or a tilt's noise by which its error falls, on what was fitted and on motions
+left out, where that matters whatever the size is. A nominal fit that makes up for something small
+on all motions may be led far astray by some of them, so that more is asked of the others."""
 SHOWN, TRACE = 0.05, 0.02
 """The same below which an effect of any size does not show."""
 
@@ -36,12 +36,12 @@ def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
     explained = _explained(nominal, model)
     if improves(model, shown, noise) or explained > GAIN:
         return True
-    predicts = shown.after < shown.before and max(_gains(model, shown, noise)) > TRACE
+    predicts = shown.better and max(_gains(model, shown, noise)) > TRACE
     return predicts and explained > SHOWN and _largest(model) >= SLIGHT
 
 
 def improves(model: Model, shown: HeldOut, noise: Noise) -> bool:
-    """Whether some joint's motions that were left out are predicted better by much."""
+    """Whether motions of some joint or of the torso are foretold better by much, left out."""
     return max(_gains(model, shown, noise)) > FORESEEN
 
 
@@ -51,19 +51,20 @@ def little(model: Model, shown: HeldOut) -> str:
         return ""
     found = ", ".join(f"{h.effect} at {h.place}" for h in model.hypotheses)
     why = "hardly changes what is predicted of motions left out"
-    if shown.after < shown.before:
+    if shown.better:
         why = (
-            f"is below {SLIGHT:g} of its typical size, or hardly shows, and lowers no joint's "
+            f"is below {SLIGHT:g} of its typical size, or hardly shows, and lowers no "
             f"error by {GAIN:g} of its noise, nor by {FORESEEN:g} on motions left out"
         )
     return f"found, but not material: {found}, which {why}"
 
 
 def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
-    """By how much the joints' errors on motions left out fall, in their noise."""
-    names, measured = model.measured.robot.joint_names, model.measured
+    """By how much errors of joints and tilts on motions left out fall, in their noise."""
+    measured = model.measured
+    names = (*measured.robot.joint_names, *TILTS)
     variance = measured.deviation(noise) ** 2
-    for name, (before, after) in shown.per_joint.items():
+    for name, (before, after) in (*shown.per_joint.items(), *shown.per_tilt.items()):
         own = measured.channel == names.index(name)
         yield (before - after) / float(np.sqrt(np.mean(variance[own])))
 

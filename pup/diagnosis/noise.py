@@ -91,11 +91,10 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
         if late:
             told = {c: replace(told[c], sigma=s, rho=late.rho) for c, s in late.sigma.items()}
     source: Literal["repeats", "assumed"] = "repeats" if told else "assumed"
-    if not told:
-        for channel in range(measured.channels):
-            flicker = _flicker(measured, errors, channel)
-            if flicker:
-                told[channel] = flicker
+    for kind in _kinds(measured):
+        if told.keys().isdisjoint(kind):  # such as tilts, where only what hangs was done again
+            flickers = ((c, _flicker(measured, errors, c)) for c in kind)
+            told |= {c: flicker for c, flicker in flickers if flicker}
     noise = _pooled(measured, told, source, int(np.median(readings)) if readings else 0)
     return replace(noise, late=late.spread, rho_late=late.memory) if late else noise
 
@@ -154,6 +153,12 @@ def _blocks(measured: Measured, errors: Array, channel: int) -> list[Array]:
     return told
 
 
+def _kinds(measured: Measured) -> tuple[range, range]:
+    """The channels of joints and those of tilts."""
+    joints = len(measured.robot.joints)
+    return range(joints), range(joints, joints + 2)
+
+
 def _pooled(
     measured: Measured,
     told: dict[int, Spread],
@@ -161,11 +166,10 @@ def _pooled(
     readings: int,
 ) -> Noise:
     """Channels that say nothing take the median of their kind, which shares its correlation."""
-    joints = len(measured.robot.joints)
     noise = assumed_noise(measured)
     least = _least(measured)
     sigma, rho = noise.sigma.copy(), noise.rho.copy()
-    for kind in (range(joints), range(joints, joints + 2)):
+    for kind in _kinds(measured):
         known = [told[c] for c in kind if c in told]
         if not known:
             continue

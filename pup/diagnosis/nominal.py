@@ -198,7 +198,9 @@ def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
         _begun(fits, part, noise)
         _moved(fits, part, noise, replays.measured.only(air))
         replays.simulated += part.simulated
-    start_best(fits, [_floors(fit) for fit in fits], replays, noise)
+    else:
+        _begun(fits, replays, noise)
+    start_best(fits, [floors(fit) for fit in fits], replays, noise)
     return sorted(fits, key=lambda fit: fit.chi2)[:LANDED]
 
 
@@ -229,7 +231,7 @@ def _moved(fits: Sequence[Fit], replays: Replays, noise: Noise, part: NDArray[np
         fit.at = found.at
 
 
-def _floors(fit: Fit) -> list[Array]:
+def floors(fit: Fit) -> list[Array]:
     """Where a fit stands, with floors of different friction."""
     if "ground_friction" not in fit.names:
         return [fit.at]

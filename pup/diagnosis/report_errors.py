@@ -43,11 +43,14 @@ def before_and_after(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     )
     noise = summary.joint_noise(diagnosis)
     joints = {spoken(name): pair for name, pair in held.per_joint.items()}
-    for what, told in (("joint", joints), ("type of motion", held.per_motion)):
+    bars = [("joint", joints, noise), ("type of motion", held.per_motion, noise)]
+    if held.per_tilt:
+        bars.append(("angle of the torso", held.per_tilt, summary.tilt_noise(diagnosis)))
+    for what, told, floor in bars:
         if len(told) < 2 and what == "joint" and len(held.per_motion) > 1:
             continue
         pairs = [pair if corrected else pair[:1] for pair in told.values()]
-        drawing = error_bars(list(told), pairs, speech.units.small, noise)
+        drawing = error_bars(list(told), pairs, speech.units.small, floor)
         takeaway = _takeaway(told, speech, corrected)
         yield figure(drawing, f"Bars of held-out errors per {what}. {takeaway}", takeaway)
     yield from _windows(diagnosis, speech)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
+from pup.diagnosis.falls import standing
 from pup.diagnosis.knocks import knocked
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.physics.terms.scale import Scale
@@ -38,6 +39,8 @@ CALM = 0.012
 """Readings that differ by less are of a joint at rest, rad."""
 FLAT = 1.4
 """Pitch beyond which the torso lies on its face or back, rad."""
+TILTS = "roll", "pitch"
+"""The torso's channels, which follow those of the joints."""
 LOST = 3.0
 """Error counted for a simulation that broke down, rad."""
 
@@ -107,7 +110,7 @@ class Measured:
           wholes: what each is the beginning of: whether a stop was met, a whole recording tells.
         """
         angle, joints = Scale.of(robot).angle, len(robot.joints)
-        steadied = tuple(steady_start(with_commands(r), CALM * angle) for r in recordings)
+        steadied = tuple(steady_start(with_commands(standing(r)), CALM * angle) for r in recordings)
         ticks = sum(len(r.time) for r in steadied)
         parts = []
         for number, (recording, whole, part) in enumerate(
@@ -215,7 +218,7 @@ def _channels(robot: RobotDescription, recording: Recording) -> list[Array]:
     columns = [recording.position[:, recording.joints.index(name)] for name in robot.joint_names]
     if recording.support == "ground":
         absent = np.full(len(recording.time), np.nan)
-        roll, pitch = (recording.extras.get(f"imu/{a}", absent) for a in ("roll", "pitch"))
+        roll, pitch = (recording.extras.get(f"imu/{a}", absent) for a in TILTS)
         columns += [np.where(np.abs(pitch) > FLAT, np.nan, roll), pitch]
     return columns
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Trace, threshold, traced
 from pup.diagnosis.exchanges import Exchanger
-from pup.diagnosis.fitting import Fit, complete, fit_together
+from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
-from pup.diagnosis.nominal import Nominal
+from pup.diagnosis.nominal import Nominal, floors
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 FALSE_ALARMS = 0.002
 """Chance that pure noise makes any hypothesis stand out."""
 ASTRAY, FAR = 0.5, 0.2
-"""A motion is lost where a joint is off by this share of what it moves, and by so much, rad."""
+"""A motion is lost where a joint or the torso is off by this share of what it moves, and by so
+much, rad."""
 LEFT = 1 / 3
 """Share of all recordings that must be left for a first look."""
 HALFWAY = 3
@@ -168,14 +169,29 @@ def _teller(progress: Callable[[str, float], None]) -> Callable[[Model], None]:
 
 
 def _carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
-    """What was found in some recordings, fitted to all; the nominal fit where that is better."""
-    known = first.model.fit
-    fit = Fit(known.coordinates, known.at.copy(), fixed=known.fixed)
+    """What was found in some recordings, fitted to all; the nominal fit where that is better.
+
+    What only the others show, as the floor's friction, starts as the nominal fit has it, or from
+    elsewhere.
+    """
+    fit = extended(first.model.fit, nominal.fit)
+    if len(fit.at) > len(first.model.fit.at):
+        start_best([fit], [[fit.at, *floors(fit)]], replays, nominal.noise)
     fit_together([fit], replays, nominal.noise)
     if fit.chi2 >= nominal.fit.chi2:
         return nominal.fit
     complete([fit], replays, nominal.noise)
     return fit
+
+
+def extended(known: Fit, whole: Fit) -> Fit:
+    """A fit to some recordings, to be gone on with for all: with what only a nominal one has."""
+    new = [i for i, c in enumerate(whole.coordinates) if c.name not in known.names]
+    return Fit(
+        (*(whole.coordinates[i] for i in new), *known.coordinates),
+        np.r_[whole.at[new], known.at],
+        fixed=known.fixed,
+    )
 
 
 def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
@@ -223,9 +239,10 @@ def _worth_a_look(measured: Measured, kept: Sequence[int]) -> bool:
 
 
 def _lost(measured: Measured, errors: Array, own: NDArray[np.bool_]) -> bool:
-    far = FAR * Scale.of(measured.robot).angle
-    for joint in range(len(measured.robot.joints)):
-        here = own & (measured.channel == joint)
+    joints = len(measured.robot.joints)
+    for channel in range(measured.channels):
+        far = FAR * Scale.of(measured.robot).angle if channel < joints else FAR
+        here = own & (measured.channel == channel)
         if here.any():
             off = float(np.sqrt(np.mean(errors[here] ** 2)))
             if off > max(far, ASTRAY * float(np.std(measured.values[here]))):

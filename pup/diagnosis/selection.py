@@ -31,7 +31,7 @@ from pup.diagnosis.starts import (
     puzzling,
     started,
 )
-from pup.diagnosis.tracing import traces
+from pup.diagnosis.tracing import by_rank, traces
 from pup.physics.terms import Place
 
 Array = NDArray[np.float64]
@@ -212,7 +212,7 @@ class Selector:
         place: dict[tuple[str, Place], int] = {}
         for rank, score in enumerate(scores(list(old.values()), unimitated(fit))):
             place.setdefault(score.trace.hypothesis.key, rank)  # by the best of its forms
-        ordered = sorted(rest, key=lambda h: place.get(h.key, len(rest)))
+        ordered = by_rank(rest, place, self.replays.measured.robot)
         leading = _whole(ordered, LEADING)
         new = traces(leading, fit, self.replays, self.noise)
         more = _whole(ordered, MOST)[len(leading) :]

@@ -174,8 +174,18 @@ def limits(diagnosis: Diagnosis) -> Array:
 
 def joint_noise(diagnosis: Diagnosis) -> float:
     """Noise of the joints that were read, root mean square, rad."""
-    joints = [c for c in channels(diagnosis) if c < len(diagnosis.robot.joints)]
-    return float(np.sqrt(np.mean(diagnosis.noise.sigma[joints] ** 2))) if joints else float("nan")
+    joints = len(diagnosis.robot.joints)
+    return _noise(diagnosis, [c for c in channels(diagnosis) if c < joints])
+
+
+def tilt_noise(diagnosis: Diagnosis) -> float:
+    """Noise of the torso's roll and pitch where they were read, root mean square, rad."""
+    joints = len(diagnosis.robot.joints)
+    return _noise(diagnosis, [c for c in channels(diagnosis) if c >= joints])
+
+
+def _noise(diagnosis: Diagnosis, some: Sequence[int]) -> float:
+    return float(np.sqrt(np.mean(diagnosis.noise.sigma[some] ** 2))) if some else float("nan")
 
 
 def first_ranking(diagnosis: Diagnosis) -> Sequence[Score]:

@@ -18,12 +18,14 @@ from pup.diagnosis.hypotheses import MODERATE, Hypothesis
 from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
+from pup.physics.terms import Place
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 
 PROMISING = 12
-"""Hypotheses of several joints whose joints are simulated one by one on the ground too."""
+"""Effects at several joints each, whatever their forms, whose joints are simulated one by one on
+the ground too."""
 
 
 def traces(
@@ -59,12 +61,43 @@ def traces(
         for h, whole in simulated((h for h in hypotheses if h not in members), ground).items():
             wholes[h] = wholes[h] + whole
         seen = (traced(h, wholes[h], project) for h in together)
-        ranking = scores([t for t in seen if t is not None], base.residual)[:PROMISING]
-        close = dict.fromkeys(m for s in ranking for m in together[s.trace.hypothesis])
+        ranking = scores([t for t in seen if t is not None], base.residual)
+        leading = list(dict.fromkeys(s.trace.hypothesis.key for s in ranking))[:PROMISING]
+        close = dict.fromkeys(m for h in together if h.key in leading for m in together[h])
         for h, whole in simulated(close, ground).items():
             wholes[h] = wholes[h] + whole
     told = (traced(h, wholes[h], project) for h in hypotheses)
     return [trace for trace in told if trace is not None]
+
+
+def by_rank(
+    hypotheses: Sequence[Hypothesis],
+    rank: Mapping[tuple[str, Place], int],
+    robot: RobotDescription,
+) -> list[Hypothesis]:
+    """Some hypotheses in the order of what they claim.
+
+    A joint that has no rank, as it was not simulated alone (see `traces`), has that of the first of
+    the groups that it belongs to.
+
+    Args:
+      hypotheses: some.
+      rank: by what is claimed, the least first.
+      robot: theirs.
+    """
+
+    def order(hypothesis: Hypothesis) -> int:
+        if hypothesis.key in rank or hypothesis.place.kind != "joint":
+            return rank.get(hypothesis.key, len(hypotheses))
+        joints = set(hypothesis.place.joints(robot))
+        told = (
+            number
+            for (effect, place), number in rank.items()
+            if effect == hypothesis.effect and joints < set(place.joints(robot))
+        )
+        return min(told, default=len(hypotheses))
+
+    return sorted(hypotheses, key=order)
 
 
 def _simulated(

@@ -22,6 +22,7 @@ from pup.physics.push import Push, Pushing
 from pup.physics.rotations import multiply, roll_pitch
 from pup.physics.servo import Servos
 from pup.physics.simulator import Trajectories, tick_slices
+from pup.physics.sinking import sink
 from pup.physics.terms import Drivetrain
 from pup.physics.writer import FieldWriter
 from pup.recording import Recording
@@ -179,6 +180,10 @@ class Run:
         for train in trains:
             self._bend(train)
             sensed = self._begun(nsim, train.rows)
+        if self.group.model.floating:
+            resting = self.ids[np.repeat(self.group.rests, self.candidates)]
+            if len(resting):
+                sink(self.batch, resting)
         # Velocities stand half a sub-step before positions, see `simulator`.
         behind = self.batch.model.opt.timestep / 2 * self.acceleration
         for train in trains:
