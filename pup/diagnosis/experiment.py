@@ -290,7 +290,7 @@ def _answers(
             if (coordinate.name, owner) in moves:
                 continue
             at = rival.fit.at.copy()
-            at[i] += difference(rival.fit, i, at)
+            at[i] += difference(rival.fit, i, at, rival.fit.width)
             moves[coordinate.name, owner] = len(rows), at[i] - rival.fit.at[i]
             rows.append(_on(rival.fit.row(at), other_floor))
     white = replays.measured.whiten(replays(rows), noise)

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 
 STEP = 0.0004
 """Finite-difference step, of a coordinate."""
+ON_GROUND, WIDEST = 50.0, 100.0
+"""The same in contact, and at most, in that step: impacts make trajectories jump by a hair of time,
+and a slope told across less than 2 % is of jumps alone."""
 DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
 """Tried at once, relative to the current one: at first, and where that led nowhere."""
 ENOUGH = 0.2
@@ -194,22 +197,33 @@ def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     if not fits:
         return
     asked = [_differences(fit, fit.at) for fit in fits]
-    told = changes([(fit.row(), rows) for fit, (_, rows) in zip(fits, asked, strict=True)], replays)
+    told = changes([(fit.row(), *d[1]) for fit, d in zip(fits, asked, strict=True)], replays)
     for fit, (steps, _), changed in zip(fits, asked, told, strict=True):
         fit.jacobian = _jacobian(steps, changed, replays, noise)
         fit.age = 0
 
 
-def _differences(fit: Fit, at: Array) -> tuple[Array, list[dict[str, float]]]:
-    """Steps of the coordinates around a point, and the column that each sets."""
-    steps = np.array([difference(fit, i, at) for i in range(len(at))])
-    moved = zip(fit.coordinates, at + steps, strict=True)
-    return steps, [{c.name: c.value(x)} for c, x in moved]
+Rows = list[dict[str, float]]
+
+
+def _differences(fit: Fit, at: Array) -> tuple[Array, tuple[Rows, Rows]]:
+    """Steps of the coordinates around a point, and the column that each sets.
+
+    Returns:
+      The steps, shape (2, n_free), and the columns: in the air, then on the ground.
+    """
+    widths = fit.width, min(ON_GROUND * fit.width, WIDEST)
+    steps = np.array([[difference(fit, i, at, w) for i in range(len(at))] for w in widths])
+
+    def columns(moved: Array) -> Rows:
+        return [{c.name: c.value(x)} for c, x in zip(fit.coordinates, moved, strict=True)]
+
+    return steps, (columns(at + steps[0]), columns(at + steps[1]))
 
 
 def _jacobian(steps: Array, changed: Array, replays: Replays, noise: Noise) -> Array:
     white = replays.measured.whiten(np.where(np.isnan(changed), 0.0, changed), noise)
-    return np.asarray((white / steps[:, None]).T)
+    return np.asarray((white / steps[replays.measured.grounded.astype(int)].T).T)
 
 
 def _reached(
@@ -223,7 +237,7 @@ def _reached(
         residuals = _residuals(fits, replays(rows), replays, noise)
         return [_Reached(at, r, None) for (_, at), r in zip(trials, residuals, strict=True)]
     asked = [_differences(fit, at) for fit, at in trials]
-    told = probed([(row, d) for row, (_, d) in zip(rows, asked, strict=True)], replays)
+    told = probed([(row, *d[1]) for row, d in zip(rows, asked, strict=True)], replays)
     residuals = _residuals(fits, np.stack([base for base, _ in told]), replays, noise)
     return [
         _Reached(at, residual, _jacobian(steps, changed, replays, noise))
@@ -237,10 +251,9 @@ def _begin(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Replay some fits where they stand, those without a Jacobian with their differences."""
     if not fits:
         return
-    asked = [
-        _differences(fit, fit.at) if fit.jacobian is None else (np.empty(0), []) for fit in fits
-    ]
-    told = probed([(fit.row(), rows) for fit, (_, rows) in zip(fits, asked, strict=True)], replays)
+    nothing: tuple[Array, tuple[Rows, Rows]] = np.empty((2, 0)), ([], [])
+    asked = [_differences(fit, fit.at) if fit.jacobian is None else nothing for fit in fits]
+    told = probed([(fit.row(), *d[1]) for fit, d in zip(fits, asked, strict=True)], replays)
     residuals = _residuals(fits, np.stack([base for base, _ in told]), replays, noise)
     for fit, residual, (steps, _), (_, changed) in zip(fits, residuals, asked, told, strict=True):
         fit.residual, fit.chi2 = residual, _chi2(fit, residual, fit.at)
@@ -261,10 +274,10 @@ def _chi2(fit: Fit, residual: Array, at: Array) -> float:
     return float(weighted @ weighted) + (fit.belief.cost(at) if fit.belief else 0.0)
 
 
-def difference(fit: Fit, i: int, at: Array) -> float:
-    """A step of a coordinate into its range, for a slope."""
+def difference(fit: Fit, i: int, at: Array, width: float = 1.0) -> float:
+    """A step of a coordinate into its range, for a slope; so many times as wide as usual."""
     coordinate = fit.coordinates[i]
-    step = fit.width * (STEP if coordinate.scale is None else 5 * STEP)
+    step = width * (STEP if coordinate.scale is None else 5 * STEP)
     return step if at[i] + step <= coordinate.upper else -step
 
 

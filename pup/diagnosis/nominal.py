@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.beginnings import SPARE, begun, moved, nearer, noise_like
 from pup.diagnosis.coordinates import Coordinate, described_at, nominal_coordinate
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.noise import noise_floor
@@ -20,11 +21,6 @@ from pup.physics.parameters import ParameterSpace
 Array = NDArray[np.float64]
 
 STARTS, LANDED = 3, 2
-HORIZONS = (1.0, 2.5)
-"""Seconds of each recording that a first fit is made to, then a second one: with all of it at once,
-a start whose motion gets out of step settles anywhere."""
-LONG = 40
-"""Steps that these first fits may take, which cost little."""
 FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
 """Frictions that a fit may start from on the ground."""
 SPREAD = 0.35
@@ -40,10 +36,9 @@ EXCESS = 0.03
 ABSOLUTE = 5.0
 OTHER = 1.5
 """A start that ends so far above a fit to the noise has ended elsewhere and says nothing of it."""
-SPARE = 0.02
-"""Share of the noise that may be left by a fit that has stopped short."""
 SHORT = 0.06
-"""The same where starts agree: it counts against every effect, and only large ones are told."""
+"""Share of the noise that a fit may leave whose starts agree: it counts against every effect, and
+only large ones are told."""
 ROUGH = 2e-3
 """Relative gain of chi-squared at which the starts may end: all that follows is the noise floor."""
 WIDER = (4.0, 1.0, 10.0, 4.0, 1.0, 0.3)
@@ -133,6 +128,8 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     noise = noise_floor(measured, replays.errors(tried[0].row()))
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
+    nearer(fits, replays, noise)
+    fit_together(fits, replays, noise)
     for away in NEAR:
         if _agree(*fits):
             break
@@ -163,7 +160,7 @@ def certified(nominal: Nominal, replays: Replays, rng: np.random.Generator) -> N
         return nominal
     recovered, left = _refit_of_itself(fit, replays, nominal.noise, rng)
     apart, near = told.starts[1] - told.starts[0], SPARE * told.samples
-    if apart < ((OTHER - 1) * fit.chi2 if _noise_like(fit) else near):
+    if apart < ((OTHER - 1) * fit.chi2 if noise_like(fit) else near):
         left = max(left, min(apart, near))  # a fit to the noise has no more to gain
     return replace(nominal, certificate=replace(told, recovered=recovered, left=left))
 
@@ -191,44 +188,17 @@ def _landed(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
     recordings = replays.measured.recordings
     air = [i for i, r in enumerate(recordings) if r.support != "ground"]
     if len(air) == len(recordings):
-        _begun(fits, replays, noise)
+        begun(fits, replays, noise)
         return list(fits)
     if air:
         part = replays.narrowed(air)
-        _begun(fits, part, noise)
-        _moved(fits, part, noise, replays.measured.only(air))
+        begun(fits, part, noise)
+        moved(fits, part, noise, replays.measured.only(air))
         replays.simulated += part.simulated
     else:
-        _begun(fits, replays, noise)
+        begun(fits, replays, noise)
     start_best(fits, [floors(fit) for fit in fits], replays, noise)
     return sorted(fits, key=lambda fit: fit.chi2)[:LANDED]
-
-
-def _begun(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
-    """Fits brought near by how the recordings begin."""
-    time = replays.measured.time
-    for horizon in HORIZONS:
-        inside = time < horizon
-        if inside.any() and not inside.all():
-            part = replays.shortened(horizon)
-            _moved(fits, part, noise, inside)
-            replays.simulated += round(inside.mean() * part.simulated)
-
-
-def _moved(fits: Sequence[Fit], replays: Replays, noise: Noise, part: NDArray[np.bool_]) -> None:
-    """Fits that begin where others of theirs have ended, on the part that is replayed."""
-    others = [
-        Fit(
-            fit.coordinates,
-            fit.at,
-            slack=fit.slack,
-            data=None if (d := fit.data) is None else d[part],
-        )
-        for fit in fits
-    ]
-    fit_together(others, replays, noise, LONG)
-    for fit, found in zip(fits, others, strict=True):
-        fit.at = found.at
 
 
 def floors(fit: Fit) -> list[Array]:
@@ -249,15 +219,9 @@ def _agree(first: Fit, second: Fit) -> bool:
     assert first.residual is not None
     least, apart = min(first.chi2, second.chi2), abs(first.chi2 - second.chi2)
     excess = least - len(first.residual)
-    if _noise_like(min(first, second, key=lambda fit: fit.chi2)):
+    if noise_like(min(first, second, key=lambda fit: fit.chi2)):
         return True
     return apart <= max(AGREEMENT * least, EXCESS * excess, ABSOLUTE, SPARE * len(first.residual))
-
-
-def _noise_like(fit: Fit) -> bool:
-    """Whether a fit leaves no more than noise: then it has not stopped short by much."""
-    assert fit.residual is not None
-    return fit.chi2 <= (1 + SPARE) * len(fit.residual)
 
 
 def _start(
@@ -280,7 +244,7 @@ def _around(
     """
     places = [best.at + away * rng.normal(size=len(best.at)) for _ in range(2)]
     others = [Fit(best.coordinates, _within(best.coordinates, at)) for at in places]
-    _begun(others[1:], replays, noise)  # how recordings begin may lead to it, or away
+    begun(others[1:], replays, noise)  # how recordings begin may lead to it, or away
     fits = [best, *others]
     fit_together(fits, replays, noise)
     return sorted(fits, key=lambda fit: fit.chi2)[:2]
@@ -305,7 +269,7 @@ def _refit_of_itself(
         start = _within(fit.coordinates, fit.at + away)
         own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1)
         if ends:
-            _begun([own], replays, noise)
+            begun([own], replays, noise)
         fit_together([own], replays, noise, iterations=8)
         ends.append((float(np.max(np.abs(own.at - fit.at) / deviation)), own.chi2))
         if ends[-1][0] <= SELF or own.chi2 < SPARE * len(simulated):

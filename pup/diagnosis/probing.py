@@ -23,8 +23,12 @@ COUPLING = frozenset(("voltage_sag",))
 """Effects by which limbs feel each other on a fixed torso too."""
 
 
+Asked = tuple[Row, Sequence[Row], Sequence[Row]]
+"""Where some probes start, the columns that each sets in the air, and those on the ground."""
+
+
 def changes(
-    asked: Sequence[tuple[Row, Sequence[Row]]],
+    asked: Sequence[Asked],
     replays: Replays,
     recordings: Sequence[int] | None = None,
 ) -> list[Array]:
@@ -33,14 +37,14 @@ def changes(
 
 
 def probed(
-    asked: Sequence[tuple[Row, Sequence[Row]]],
+    asked: Sequence[Asked],
     replays: Replays,
     recordings: Sequence[int] | None = None,
 ) -> list[tuple[Array, Array]]:
     """Simulations of some rows, and what probes change in them, all in one replay.
 
     Args:
-      asked: where some probes start, and the columns that each of them sets.
+      asked: some probes, as many in the air as on the ground.
       replays: simulates.
       recordings: simulate these only, and leave the others' samples at zero.
 
@@ -55,31 +59,33 @@ def probed(
     apart = limbs_of(measured.robot, measured.recordings)
     limbs = [
         np.zeros_like(apart) if coupled([*replays.space.names, *here]) else apart
-        for here, _ in asked
+        for here, _, _ in asked
     ]
     packs = [
         _packs(probes, measured.robot, own) if fixed else []
-        for (_, probes), own in zip(asked, limbs, strict=True)
+        for (_, probes, _), own in zip(asked, limbs, strict=True)
     ]
     calls: list[tuple[list[Row], list[int]]] = []
     if fixed:
         rows = [
             row
-            for (here, probes), packed in zip(asked, packs, strict=True)
+            for (here, probes, _), packed in zip(asked, packs, strict=True)
             for row in (here, *(_merged(here, probes, pack) for pack in packed))
         ]
         calls.append((rows, fixed))
     if ground:
         calls.append(
-            ([r for here, p in asked for r in (here, *({**here, **q} for q in p))], ground)
+            ([r for here, _, p in asked for r in (here, *({**here, **q} for q in p))], ground)
         )
     answers = iter(replays.together(calls))
     n = len(measured.values)
-    out = [(np.zeros(n), np.zeros((len(probes), n))) for _, probes in asked]
+    out = [(np.zeros(n), np.zeros((len(probes), n))) for _, probes, _ in asked]
     if fixed:
         told = next(answers)
         inside = measured.only(fixed)
-        for (_, probes), own, packed, (base, changed) in zip(asked, limbs, packs, out, strict=True):
+        for (_, probes, _), own, packed, (base, changed) in zip(
+            asked, limbs, packs, out, strict=True
+        ):
             limb = own[measured.channel[inside]]
             base[inside], told = told[0], told[1:]
             for pack in packed:
@@ -90,7 +96,7 @@ def probed(
     if ground:
         told = next(answers)
         inside = measured.only(ground)
-        for (_, probes), (base, changed) in zip(asked, out, strict=True):
+        for (_, _, probes), (base, changed) in zip(asked, out, strict=True):
             base[inside] = told[0]
             changed[:, inside] = told[1 : 1 + len(probes)] - told[0]
             told = told[1 + len(probes) :]

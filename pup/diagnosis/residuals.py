@@ -141,6 +141,13 @@ class Measured:
         return len(self.robot.joints) + 2
 
     @cached_property
+    def grounded(self) -> NDArray[np.bool_]:
+        """Which samples are of recordings on the ground, shape (n_samples,)."""
+        return np.array([r.support == "ground" for r in self.recordings], dtype=bool)[
+            self.recording
+        ]
+
+    @cached_property
     def _follows(self) -> NDArray[np.bool_]:
         """Whether a sample follows another of its run."""
         same = (np.diff(self.recording) == 0) & (np.diff(self.channel) == 0)

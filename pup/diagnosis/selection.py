@@ -12,6 +12,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.beginnings import nearer
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
@@ -238,6 +239,7 @@ class Selector:
         seen = min(fit.chi2 for fit in fits)
         hope = HOPE * (start - seen) + MARGIN
         promising = [fit for fit in fits if fit is fits[0] or fit.chi2 - seen < hope]
+        nearer(promising, self.replays, self.noise)
         fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
         ranked = sorted(tried, key=lambda one: one[1].chi2)
         family, least = ranked[0][0][-1].family, ranked[0][1].chi2

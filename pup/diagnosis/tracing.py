@@ -109,7 +109,7 @@ def _simulated(
 ) -> dict[Hypothesis, Array]:
     """Whitened changes of some recordings' samples per typical size, (n_samples, n_magnitudes)."""
     probes = [probe for h in hypotheses for probe in h.probes()]
-    changed = changes([(base.row(), probes)], replays, recordings)[0]
+    changed = changes([(base.row(), probes, probes)], replays, recordings)[0]
     white = replays.measured.whiten(changed, noise) / MODERATE
     ends = np.cumsum([0, *(len(h.magnitudes) for h in hypotheses)])
     return {h: white[a:b].T for h, a, b in zip(hypotheses, ends[:-1], ends[1:], strict=True)}
