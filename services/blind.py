@@ -12,6 +12,7 @@ from pup.errors import InputError
 from pup.files import write_atomic, write_json
 from services import places
 from services.blind_journal import JOURNAL, SAME_SET, Journal, doubts, read_journal
+from services.held import held
 from services.progress import counted
 
 
@@ -54,11 +55,12 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     from services.blind_run import orders, run_cases
 
     wanted, commitment = orders(options.set, options.out, options.limit)
-    journal = Journal(options.out, commitment)
-    if not all(order.done for order in wanted):
-        with places.cases(options) as (pools, lanes), counted("blind run") as tell:
-            run_cases(wanted, journal, pools, lanes, tell)
-    return {"cases": len(wanted), "out": str(options.out), **journal.document()}
+    with held(options.out):
+        journal = Journal(options.out, commitment)
+        if not all(order.done for order in wanted):
+            with places.cases(options) as (pools, lanes), counted("blind run") as tell:
+                run_cases(wanted, journal, pools, lanes, tell)
+        return {"cases": len(wanted), "out": str(options.out), **journal.document()}
 
 
 def score(options: argparse.Namespace) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 from pup.blind.score import DIAGNOSIS
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
+from services.held import LOCK
 from services.provenance import ALSO, engine, now
 
 JOURNAL = "run.json"
@@ -37,7 +38,7 @@ class Journal:
         of_set = {name: commitment.get(name) for name in SAME_SET}
         told = read_journal(folder)
         if told is None:
-            if any(folder.iterdir()):
+            if {file.name for file in folder.iterdir()} - {LOCK}:
                 raise InputError(f"{folder}: not empty, and no {JOURNAL} in it; use another folder")
             told = {"schema": 1, "set": of_set, "engine": self.engine, "sessions": []}
         if told["set"] != of_set:

@@ -14,7 +14,6 @@ that was given up is shut out: its process reads in order.json that another one 
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from pup.files import read_json, sha256, write_json
 
 SCHEMA = 1
 JOBS = "jobs"
+ORDER = "order.json"
 REVOKED = 75
 """Exit code of a process whose attempt is another's, or was called off before it began."""
 
@@ -91,7 +91,7 @@ class JobFolder:
 
     def write_order(self, order: Order) -> None:
         """Tell the job's process what to do."""
-        write_json(self.path / "order.json", {"schema": SCHEMA} | asdict(order))
+        write_json(self.path / ORDER, {"schema": SCHEMA} | asdict(order))
 
     def order(self) -> Order:
         """What to do.
@@ -99,12 +99,23 @@ class JobFolder:
         Raises:
           InputError: the file is absent or no order.
         """
-        return Order(**_read(self.path / "order.json"))
+        return Order(**_read(self.path / ORDER))
 
     def revoke(self) -> None:
-        """Have what runs stop, and nothing begin."""
-        with suppress(InputError):  # without an order nothing begins either
-            self.write_order(replace(self.order(), stop=True))
+        """Have what runs stop, and nothing begin.
+
+        Raises:
+          OSError: the storage is not there, or takes no files now.
+        """
+        try:
+            order = self.order()
+        except InputError as error:
+            there = self.path.parent.is_dir() and not (self.path / ORDER).exists()
+            if there:  # without an order nothing begins either
+                return
+            raise OSError(str(error)) from error
+        if not order.stop:
+            self.write_order(replace(order, stop=True))
 
     def claim(self, attempt: int) -> bool:
         """Take an attempt; False where another process has it."""
@@ -189,6 +200,12 @@ def below(folder: Path) -> Iterator[tuple[str, Path]]:
             path = Path(place) / name
             if not name.startswith(".") and path.is_file() and not path.is_symlink():
                 yield path.relative_to(folder).as_posix(), path
+
+
+def turn(name: str) -> tuple[tuple[bool, str], ...]:
+    """What `below` sorts names by: the files of a folder come before those of folders in it."""
+    *folders, file = name.split("/")
+    return (*((True, folder) for folder in folders), (False, file))
 
 
 def inside(folder: Path, name: str) -> Path | None:

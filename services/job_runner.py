@@ -19,6 +19,7 @@ from tempfile import mkdtemp
 from typing import IO
 
 from pup.errors import InputError
+from services.held import OURS
 from services.job_folder import REVOKED, JobFolder, Outcome
 from workers import reaper
 
@@ -79,7 +80,7 @@ class Runner:
             child = subprocess.Popen(
                 [sys.executable, "-m", "services.cli", *command],
                 cwd=self.folder.shared,
-                env=os.environ | SAFE,
+                env=os.environ | SAFE | OURS,  # no lock of a node that vanished is waited for
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -85,6 +85,8 @@ class Journal:
         same = self._entry(stage).get("inputs") == inputs
         if stage.folder:
             if self._told["begun"].get(stage.name, inputs) != inputs or (same and stage.remade):
+                # Begun from nothing until it is empty: who is stopped in between empties it again.
+                self._write("begun", stage, None)
                 shutil.rmtree(self.out / stage.folder, ignore_errors=True)
             self._write("begun", stage, inputs)
         begin = time.time()
@@ -94,8 +96,10 @@ class Journal:
         done = {"inputs": inputs, "seconds": seconds, "files": files}
         self._write("stages", stage, done)
 
-    def _write(self, part: str, stage: Stage, told: dict[str, Any]) -> None:
+    def _write(self, part: str, stage: Stage, told: dict[str, Any] | None) -> None:
         with self._writing:
+            if part == "begun":  # and so no longer done: what it leaves now is to be gone on from
+                self._told["stages"].pop(stage.name, None)
             self._told[part][stage.name] = told
             write_json(self.file, self._told)
 

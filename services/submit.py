@@ -14,7 +14,7 @@ from pup.errors import InputError
 from pup.files import sha256
 from services.failures import FailedError
 from services.job_arguments import command
-from services.transfer import Gateway, token_of
+from services.transfer import PATIENCE, Gateway, away, detail, token_of
 
 PERIOD = 1.0
 """Between two looks at a job, s."""
@@ -92,7 +92,7 @@ def _retry(gateway: Gateway, options: argparse.Namespace) -> dict[str, Any]:
 
 def _fetch(gateway: Gateway, options: argparse.Namespace) -> dict[str, Any]:
     place = f"{_place(options)}/artifacts"
-    listed = gateway.get(place)["artifacts"]
+    listed = gateway.all(place, "artifacts")
     known = {a["name"] for a in listed}
     if missing := [name for name in options.names if name not in known]:
         raise InputError(f"{options.job} has no artefact {missing[0]}")
@@ -128,19 +128,38 @@ def _download(gateway: Gateway, place: str, artifact: dict[str, Any], out: Path)
 
 
 def _log(gateway: Gateway, job: str, follow: bool) -> Iterator[str]:
-    """What a job says; a stream that broke is taken up where it was."""
+    """What a job says; a stream that broke, or does not come yet, is taken up where it was.
+
+    Raises:
+      InputError: the gateway refuses it, or is away for too long.
+    """
+    place, heard = f"/v1/jobs/{job}", time.monotonic()
     at, over, text = 0, False, getincrementaldecoder("utf-8")("replace")
+    said = ""
     while not over:
-        over = not follow or gateway.get(f"/v1/jobs/{job}")["state"] not in OPEN
+        ended = gateway.get(place)["state"] not in OPEN  # waits for a gateway that is away
         query = {"offset": at, "follow": "true" if follow else "false"}
         try:
-            with gateway.http.stream("GET", f"/v1/jobs/{job}/logs", params=query) as answer:
-                for chunk in answer.iter_bytes():
-                    at += len(chunk)
-                    yield text.decode(chunk)
-        except httpx.HTTPError:
-            over = False
-            time.sleep(PERIOD)
+            with gateway.http.stream("GET", f"{place}/logs", params=query) as answer:
+                if answer.status_code == 200:
+                    heard, said = time.monotonic(), ""
+                    for chunk in answer.iter_bytes():
+                        at += len(chunk)
+                        yield text.decode(chunk)
+                    over = ended or not follow
+                    continue
+                answer.read()
+            why = away(answer)
+            if not why:
+                raise InputError(f"{gateway.url}: no log of {job}: {detail(answer)}")
+            if why != said:
+                gateway.told(f"the log of {job} does not come ({why}); waiting")
+            said = why
+        except httpx.HTTPError as error:  # also of a job that says nothing for long
+            why = str(error) or type(error).__name__
+        if time.monotonic() - heard > PATIENCE:
+            raise InputError(f"{gateway.url}: the log of {job} does not come ({why})")
+        time.sleep(PERIOD)
 
 
 def _ended(gateway: Gateway, job: str) -> Any:

@@ -17,6 +17,7 @@ from typing import Any
 from pup.errors import InputError, how_to_install
 from pup.robot import RobotDescription
 from services import places
+from services.held import held
 
 
 def _run(options: argparse.Namespace) -> dict[str, Any]:
@@ -56,7 +57,7 @@ def _run(options: argparse.Namespace) -> dict[str, Any]:
         _tell,
         places.cores(options),
     )
-    with _folder(options.out) as out, staying():
+    with _folder(options.out) as out, held(out), staying():
         done = run(robot, recordings, mission, out, means)
     return done | {
         "report": str(out / "report.html"),
@@ -72,10 +73,9 @@ def _presysid(options: argparse.Namespace) -> dict[str, Any]:
 
     robot = RobotDescription.load(options.robot)
     recordings = load_recordings(options.recordings, robot)
-    with _folder(options.out) as out, places.fits(options) as runner, reporter() as progress:
-        bounds = identify(
-            robot, recordings, _budget(options, robot), out, runner, progress, places.cores(options)
-        )
+    wanted, cores = _budget(options, robot), places.cores(options)
+    with _folder(options.out) as out, held(out), places.fits(options) as runner, reporter() as told:
+        bounds = identify(robot, recordings, wanted, out, runner, told, cores)
     return {
         "presysid": bounds.document(),
         "report": str(out / "report.html"),
@@ -95,7 +95,7 @@ def _train(options: argparse.Namespace) -> dict[str, Any]:
     check(tuple(options.track))
     robot = RobotDescription.load(options.robot)
     wanted = training_options(options)
-    with _folder(options.out) as out, trained() as told, stages() as said:
+    with _folder(options.out) as out, held(out), trained() as told, stages() as said:
         ray = partial(places.training, options)
         return train(robot, options.bounds, wanted, out, ray, told, said)
 
@@ -219,17 +219,9 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
     recordings = load_recordings(options.recordings, robot)
     if options.seconds is not None:
         recordings = [beginning(recording, options.seconds) for recording in recordings]
-    with _folder(options.out) as out, places.replays(options) as where, stages() as progress:
-        return run_diagnosis(
-            robot,
-            recordings,
-            out,
-            where,
-            progress,
-            options.seed,
-            rivals=options.rivals,
-            effects=options.effects,
-        )
+    wanted = {"seed": options.seed, "rivals": options.rivals, "effects": options.effects}
+    with _folder(options.out) as out, held(out), places.replays(options) as where, stages() as told:
+        return run_diagnosis(robot, recordings, out, where, told, **wanted)
 
 
 def _import(options: argparse.Namespace) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,19 @@ class Job:
         while left := self.left():
             assert time.monotonic() < deadline, left
             time.sleep(0.1)
+
+
+@contextmanager
+def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that has a folder for itself."""
+    code = "import sys; from pathlib import Path; from services.held import held\n"
+    code += "with held(Path(sys.argv[1])): print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, str(folder)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline()
+        yield process
+        process.kill()
 
 
 def command_of(process: psutil.Process) -> list[str]:

@@ -55,11 +55,13 @@ class RayCluster:
 
     def start_head(self) -> None:
         more = (f"--port={self.gcs}", f"--dashboard-port={self.dashboard}", "--num-cpus=0")
-        self._start("head", 1, "--head", "--include-dashboard=true", *more)
+        place = ("--node-ip-address=127.0.0.1", "--include-dashboard=true")
+        self._start("head", 1, "--head", *place, *more)
 
-    def start_worker(self, number: int, cpus: int = 1) -> None:
+    def start_worker(self, number: int, cpus: int = 1, ip: str = "127.0.0.1") -> None:
         there, address = self._alive(), f"--address=127.0.0.1:{self.gcs}"
-        self._start(f"worker{number}", there + 1, address, f"--num-cpus={cpus}")
+        more = (f"--num-cpus={cpus}", f"--node-ip-address={ip}")
+        self._start(f"worker{number}", there + 1, address, *more)
 
     def _alive(self) -> int:
         """Nodes that the cluster believes in."""
@@ -119,8 +121,8 @@ class RayCluster:
             environment.pop(name, None)
         command = [
             *(sys.executable, "-m", "ray.scripts.scripts", "start", "--block"),
-            *("--node-ip-address=127.0.0.1", "--object-store-memory=80000000"),
-            *("--disable-usage-stats", f"--dashboard-agent-listen-port={free_port()}"),
+            *("--object-store-memory=80000000", "--disable-usage-stats"),
+            f"--dashboard-agent-listen-port={free_port()}",
             *((f"--temp-dir={self.temp}",) if "--head" in arguments else ()),
             *arguments,
         ]
@@ -142,12 +144,12 @@ class RayCluster:
 
 @contextmanager
 def two_workers(folder: Path) -> Iterator[RayCluster]:
-    """A head and two workers of two cores each."""
+    """A head and two workers of two cores each, the second one at an address of its own."""
     made = RayCluster(folder)
     try:
         made.start_head()
         for number in (1, 2):
-            made.start_worker(number, cpus=2)
+            made.start_worker(number, cpus=2, ip=f"127.0.0.{number}")
         yield made
     finally:
         made.close()

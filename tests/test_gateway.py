@@ -227,6 +227,22 @@ def test_a_token_that_is_revoked_ends_at_once(service):
     assert (service.data / "tokens.json").stat().st_mode & 0o077 == 0
 
 
+def test_a_file_of_tokens_that_is_torn_keeps_nobody_from_stopping_a_robot(service):
+    file = service.data / "tokens.json"
+    whole = file.read_text()
+    with service.client() as http:
+        assert http.get("/v1/studies").status_code == 200
+        file.write_text(whole[: len(whole) // 2])
+        try:
+            told = is_problem(http.post("/v1/agents/nobody:stop", json={"reason": "smoke"}), 404)
+            assert "nobody" in told
+        finally:
+            file.write_text(whole)
+        assert http.get("/v1/studies").status_code == 200
+    log = (service.data / "log.jsonl").read_text().splitlines()
+    assert sum("tokens cannot be read" in line for line in log) == 1
+
+
 def test_an_operator_holds_the_gate(service):
     """Nothing goes to the robot before it is released; stop pauses the study."""
     keys = service.agent_keys("gate-1")

@@ -189,7 +189,49 @@ def test_artefacts_by_name(service):
             "/v1/jobs/job-done/artifacts/checkpoints/fit 1%25.npz", headers={"Range": "bytes=1-3"}
         )
         assert (part.status_code, part.content) == (206, b"\x01\x02\x03")
-        assert http.get("/v1/jobs/job-running/artifacts").json() == {"artifacts": []}
+        none = http.get("/v1/jobs/job-running/artifacts").json()
+        assert none == {"artifacts": [], "next": None}
+
+
+@pytest.fixture(scope="module")
+def many(service):
+    """More files than a page of their list holds; those that pages look for come last."""
+    out = shared(service) / "jobs" / "job-cancelled" / "out"
+    for folder, names in (("a", range(10_000)), ("presysid", ["bounds.json"]), (".", ["z"])):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+        for name in names:
+            (out / folder / str(name)).touch()
+    return "job-cancelled"
+
+
+def test_artefacts_are_listed_in_pages(service, many):
+    place = f"/v1/jobs/{many}/artifacts"
+    with service.client("viewer") as http:
+        first = http.get(place).json()
+        assert len(first["artifacts"]) == 10_000 and first["next"] == "a/9998"
+        second = http.get(place, params={"after": "a/9998"}).json()
+        assert [a["name"] for a in second["artifacts"]] == ["a/9999", "presysid/bounds.json"]
+        assert second["next"] is None
+        few = http.get(place, params={"limit": 2}).json()
+        assert ([a["name"] for a in few["artifacts"]], few["next"]) == (["z", "a/0"], "a/0")
+        after = http.get(place, params={"limit": 1, "after": "a/00"}).json()  # as if it was removed
+        assert [a["name"] for a in after["artifacts"]] == ["a/1"]
+        is_problem(http.get(place, params={"limit": 0}), 422)
+
+
+def test_no_artefact_is_left_out_of_what_is_fetched(service, many, where, tmp_path):
+    done = pup("jobs", "fetch", many, "presysid/bounds.json", "--out", tmp_path, *where)
+    assert done.code == 0, done.err
+    assert set(files(tmp_path)) == {"presysid/bounds.json"}
+
+
+def test_the_page_of_a_job_shows_some_of_many_files(service, many):
+    cookies = {"pup_token": service.tokens["viewer"]}
+    shown = httpx.get(f"{service.url}/jobs/{many}", cookies=cookies).text
+    assert shown.count(" download>") == 100 and "The first 100; all of them" in shown
+    assert f"/bounds/{many}" in shown
+    few = httpx.get(f"{service.url}/jobs/job-done", cookies=cookies).text
+    assert few.count(" download>") == 2 and "all of them" not in few
 
 
 ELSEWHERE = ("../order.json", "..%2forder.json", "%2e%2e/order.json", "/etc/hostname", "absent")

@@ -8,14 +8,16 @@ import time
 from pathlib import Path
 
 import pytest
+from commandline import TINY
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jobs import holder
 
 from pup.errors import InputError
 from services.arguments import parser
 from services.gateway.jobs import Job, JobState, Seen, Status, reconciled
 from services.job_arguments import VERBS, command
-from services.job_folder import REVOKED, JobFolder, Order, Outcome, folder_of
+from services.job_folder import REVOKED, JobFolder, Order, Outcome, below, folder_of, turn
 
 OUT = Path("/shared/jobs/job-1/out")
 FIT = ("recordings", "--robot", "servo_bench")
@@ -190,7 +192,7 @@ def test_an_outcome_in_shared_storage_goes_before_a_cluster_that_forgot():
 
 
 def order(folder, attempt, *command, stop=False, fresh=False):
-    folder.write_order(Order(folder.path.name, attempt, stop, fresh, list(command)))
+    folder.write_order(Order(folder.path.name, attempt, stop, fresh, [str(c) for c in command]))
 
 
 def runner(folder, attempt):
@@ -232,6 +234,17 @@ def test_a_process_runs_its_verb_once_and_says_how_it_ended(folder):
     order(folder, 2, "replay", "absent", "--robot", "servo_bench", "--out", str(folder.out))
     assert runner(folder, 2).wait(60) == 2
     assert "absent" in folder.outcome(2).told
+
+
+def test_a_lock_that_a_node_left_behind_holds_no_attempt_up(folder):
+    """It comes to where the verb has its folder, and refuses its input there."""
+    folder.out.mkdir()
+    start = folder.out / "bounds.json"
+    start.write_text("{}")
+    order(folder, 1, "presysid", *FIT, *TINY, "--start", start, "--out", folder.out)
+    with holder(folder.out):
+        assert runner(folder, 1).wait(120) == 2, folder.tail(4096)
+    assert "lies in the folder that is written to" in folder.outcome(1).told
 
 
 def test_a_file_in_the_shared_storage_is_no_library(folder):
@@ -300,6 +313,14 @@ def test_names_lead_to_artefacts_and_nowhere_else(tmp_path):
     wrong += ("way/secret", "sub//b c.npz", ".a.json.part", "a.json\0", "..\\secret", "./a.json")
     for name in wrong:
         assert folder.file(name) is None, name
+
+
+def test_files_come_in_the_order_that_pages_go_on_in(tmp_path):
+    for name in ("b", "a/c", "a-b/d", "a/b/e", "a/b.x", "ä", "a b/f", "B/g"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    names = [name for name, _ in below(tmp_path)]
+    assert len(names) == 8 and names == sorted(names, key=turn)
 
 
 def test_the_tail_of_a_log_begins_with_a_line(tmp_path):

@@ -2,7 +2,9 @@
 
 import argparse
 import asyncio
+import errno
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,13 +14,13 @@ pytest.importorskip("fastapi")
 
 from pup.errors import InputError
 from services.failures import FailedError
-from services.gateway.dispatcher import Dispatcher
-from services.gateway.job_routes import document
+from services.gateway.dispatcher import Dispatcher, NoJobsError
+from services.gateway.job_routes import artifacts, document
 from services.gateway.jobs import Job, JobState, Seen, Status
 from services.gateway.metrics import Metrics
 from services.gateway.store import Store
 from services.job_arguments import command, tasks
-from services.job_folder import Outcome
+from services.job_folder import JobFolder, Outcome
 from services.places import training
 from workers.cluster import connected, staying
 
@@ -31,6 +33,7 @@ class Ray:
 
     def __init__(self) -> None:
         self.asked: list[str] = []
+        self.stopped: list[str] = []
         self.full = set[str]()  # submissions that Ray has given up
 
     async def check(self) -> None:
@@ -38,6 +41,9 @@ class Ray:
 
     async def submit(self, submission: str, entrypoint: str, cpus: float, gpus: float) -> None:
         self.asked.append(submission)
+
+    async def stop(self, submission: str) -> None:
+        self.stopped.append(submission)
 
     async def seen(self, submission: str) -> Seen:
         if submission in self.full:
@@ -146,6 +152,88 @@ def test_runners_share_what_is_free_beside_the_process() -> None:
         ray.get(other.ready.remote())
         with pytest.raises(FailedError, match="1 cores"), training(options(2)):
             pass
+
+
+@pytest.mark.parametrize("trouble", ["away", "full"])
+def test_a_cancel_is_repeated_until_the_storage_takes_it(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: str
+) -> None:
+    shared = tmp_path / "shared"
+    (shared / "recordings").mkdir(parents=True)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    async def told() -> None:
+        ray = Ray()
+        jobs = Dispatcher(store, ray, shared, Metrics(), lambda _: None)
+        name = (await jobs.submit(job(), None))[0].id
+        for _ in range(2):
+            await jobs.tick()
+        jobs.folder(name).claim(1)
+        with monkeypatch.context() as patch:
+            if trouble == "away":
+                shared.rename(tmp_path / "unmounted")
+            else:
+                patch.setattr("services.job_folder.write_json", full)
+            for _ in range(2):
+                with pytest.raises(NoJobsError, match=r"is called off, but the shared storage"):
+                    await jobs.cancel(name, "ann")
+            await jobs.tick()
+            assert jobs.job(name).state is JobState.CANCELLING
+            assert "the shared storage, which takes no files" in jobs.waits_for(jobs.job(name))
+            assert set(ray.stopped) <= {f"{name}-1"} and bool(ray.stopped) == (trouble == "full")
+        if trouble == "away":
+            (tmp_path / "unmounted").rename(shared)
+        await jobs.tick()
+        assert jobs.folder(name).order().stop and not jobs.trouble
+        written = jobs.folder(name).path / "order.json"
+        before = written.stat().st_mtime_ns
+        await jobs.tick()
+        assert written.stat().st_mtime_ns == before  # once is enough
+        jobs.folder(name).write_outcome(Outcome(1, 130))
+        await jobs.tick()
+        assert jobs.job(name).state is JobState.CANCELLED
+
+    asyncio.run(told())
+
+
+def test_a_job_whose_folder_was_removed_can_be_called_off(store: Store, tmp_path: Path) -> None:
+    async def told() -> None:
+        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None)
+        name = (await jobs.submit(job(), None))[0].id
+        for _ in range(2):
+            await jobs.tick()
+        shutil.rmtree(jobs.folder(name).path)
+        assert (await jobs.cancel(name, "ann")).state is JobState.CANCELLED
+
+    asyncio.run(told())
+
+
+def test_a_file_that_is_removed_while_files_are_listed_is_none(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = JobFolder.files
+
+    def files(folder: JobFolder) -> Iterator[tuple[str, Path]]:
+        for name, path in found(folder):
+            if name == "a":
+                path.unlink()  # after it was found, before it is asked for its size
+            yield name, path
+
+    monkeypatch.setattr(JobFolder, "files", files)
+
+    async def told() -> None:
+        jobs = Dispatcher(store, Ray(), tmp_path, Metrics(), lambda _: None)
+        made, _ = await jobs.submit(job(), None)
+        out = jobs.folder(made.id).out
+        out.mkdir()
+        for name in "abc":
+            (out / name).touch()
+        listed, more = await artifacts(jobs, made, 2)
+        assert [row["name"] for row in listed] == ["b", "c"] and more is None
+
+    asyncio.run(told())
 
 
 def test_storage_that_hangs_takes_no_threads_of_others(store: Store, tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
 """Cores for runners: each has its own on one node, whatever the nodes have together."""
 
 import argparse
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -55,10 +58,13 @@ def test_runners_that_wait_for_a_cluster_to_grow_say_so(
             pass
 
 
-@pytest.fixture
-def two_nodes(tmp_path: Path) -> Iterator[RayCluster]:
-    with two_workers(tmp_path) as cluster:
-        yield cluster
+@pytest.fixture(scope="module")
+def two_nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayCluster]:
+    """Whose processes can import the tests' own tasks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        with two_workers(tmp_path_factory.mktemp("ray")) as cluster:
+            yield cluster
 
 
 @pytest.mark.ray
@@ -73,3 +79,22 @@ def test_a_runner_takes_no_more_cores_than_a_node_has(
     where = ("--address", f"127.0.0.1:{two_nodes.gcs}", "--runners", 1)
     done = pup_process("train", *small, *where, "--json", "--out", tmp_path / "out")
     assert done.json()["done"]
+
+
+@pytest.mark.ray
+def test_nothing_is_put_on_a_head_that_does_no_work(
+    two_nodes: RayCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is a learner anywhere but where its samples come from; none of them holds a core."""
+    pytest.importorskip("torch")
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", two_nodes.token)
+    program = [sys.executable, Path(__file__).with_name("placed.py")]
+    done = subprocess.run(
+        [*program, f"127.0.0.1:{two_nodes.gcs}"], capture_output=True, text=True, timeout=570
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["head"] not in told["fits"] and len(set(told["fits"])) == 2
+    assert told["free"] == 4
+    assert told["learners"] == [told["trains"]]

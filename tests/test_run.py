@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -35,10 +34,10 @@ PATIENCE = 300.0
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Darwin OP2 with a policy that moves by what it sees and by eta, and stands for a while."""
-    folder = tmp_path_factory.mktemp("robot") / "darwin_op2"
-    shutil.copytree(DARWIN.folder, folder, ignore=shutil.ignore_patterns("recordings", POLICIES))
+    gait = agents.standing()
+    folder = agents.described(tmp_path_factory.mktemp("robot") / "darwin_op2", gait)
     names = read_bounds(DARWIN.identified_path, DARWIN).names
-    agents.bundle(folder / POLICIES / "forward", agents.standing(), names, lively=True)
+    agents.bundle(folder / POLICIES / "forward", gait, names, lively=True)
     return folder
 
 

@@ -100,6 +100,40 @@ def test_an_interrupted_stage_finds_what_it_left_unless_its_inputs_changed(tmp_p
     assert kept(tmp_path) == ["attempt3"]
 
 
+def test_a_stage_that_is_done_anew_goes_on_from_what_it_left(tmp_path: Path) -> None:
+    """However often it is interrupted: that it was done once is forgotten when it is begun."""
+    counter = Counter(tmp_path)
+    Journal(tmp_path).once(counter.stage())
+    (tmp_path / "one" / "x.json").write_text("{}")
+    counter.fails = True
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            Journal(tmp_path).once(counter.stage())
+    counter.fails = False
+    Journal(tmp_path).once(counter.stage())
+    assert kept(tmp_path) == ["attempt2", "attempt3"]
+
+
+@pytest.mark.parametrize("value", ["a", "b"])
+def test_who_is_stopped_while_a_folder_is_emptied_empties_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    """Neither what is half gone nor what is left of other inputs is taken for a beginning."""
+    counter = Counter(tmp_path)
+    Journal(tmp_path).once(counter.stage())
+    (tmp_path / "one" / "x.json").write_text("{}")
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("services.stages.shutil.rmtree", stop)
+        Journal(tmp_path).once(counter.stage(value))
+    assert not Journal(tmp_path).inputs("one")
+    Journal(tmp_path).once(counter.stage(value))
+    assert counter.count == 2 and kept(tmp_path) == []
+
+
 def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text('{"stages": []}')
     with pytest.raises(InputError, match="not the journal"):

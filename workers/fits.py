@@ -206,9 +206,18 @@ def _cores() -> int:
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
-@ray.remote(num_cpus=0, max_restarts=RETRIES, max_task_retries=RETRIES, max_concurrency=2)
+@ray.remote(
+    scheduling_strategy="SPREAD",
+    max_restarts=RETRIES,
+    max_task_retries=RETRIES,
+    max_concurrency=2,
+)
 class FitActor:
-    """Owns one fit; see the module."""
+    """Owns one fit; see the module.
+
+    Without `num_cpus` Ray places it where there is a core, and has it hold none; with 0 it would be
+    put anywhere, on a head too that is to do no work.
+    """
 
     def __init__(self) -> None:
         self.name = ""

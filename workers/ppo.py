@@ -26,6 +26,7 @@ from pup.policy.losses import Losses
 from pup.policy.shape import PolicyShape
 from workers.learner import FragmentsToBatch, Learning, MirrorLearner
 from workers.module import PolicyModule
+from workers.nodes import beside
 from workers.rollouts import BatchRunner, Fragment, Sampling, spaces
 from workers.runners import LEAST_SECONDS, Crew
 
@@ -222,11 +223,10 @@ def _start(setup: Setup) -> BatchPPO:
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     seen, done = spaces(setup.shape.proprioception, setup.shape.joints, setup.shape.bins)
-    here = torch.cuda.is_available()
     shared = setup.runners == 0 and setup.sampling.threads > 1
     minibatch = setup.learning.minibatch
     free = ray.available_resources().get("GPU", 0) >= 1
-    remote, gpus = learner_place(minibatch, here, free, shared)
+    remote, gpus = learner_place(minibatch, torch.cuda.is_available(), free, shared)
     if minibatch >= GPU_MINIBATCH and not gpus and ray.cluster_resources().get("GPU", 0):
         line = "others have the cluster's GPUs: the learner takes a processor; stop and repeat the "
         print(line + "command for a GPU once one is free", file=sys.stderr, flush=True)
@@ -251,6 +251,7 @@ def _start(setup: Setup) -> BatchPPO:
             num_learners=remote,
             num_cpus_per_learner=0,  # runners may have all there are; it would wait for ever
             num_gpus_per_learner=gpus,
+            custom_resources_per_learner={} if gpus else beside(),
             learner_connector=lambda *_: FragmentsToBatch(setup.learning),
             add_default_connectors_to_learner_pipeline=False,
         )
@@ -378,9 +379,8 @@ class Trainer:
         """What the runners that sample answer, in their order."""
         self.algorithm.settle()
         group = self.algorithm.env_runner_group
-        here = not self.setup.runners
         told = group.foreach_env_runner(
-            action, local_env_runner=here, timeout_seconds=LEAST_SECONDS
+            action, local_env_runner=not self.setup.runners, timeout_seconds=LEAST_SECONDS
         )
         return list(told)
 

@@ -21,6 +21,7 @@ from services.experiment.cells import Cell, chosen
 from services.experiment.inputs import different
 from services.experiment.work import KINDS, LEFT, RESULT, Task
 from services.failures import ERROR, SHOWN, caught, lost, mended, named
+from services.held import LEASE, held
 from services.places import Pools
 from services.progress import Told
 from services.provenance import ALSO, engine, now
@@ -217,8 +218,10 @@ def work_on(order: Order) -> Outcome:
     begin = time.monotonic()
     try:
         order.folder.mkdir(parents=True, exist_ok=True)
-        _spare(order)
-        Journal(order.folder).once(order.stage())
+        # Ray repeats a cell whose node it lost; that one may work on for a while.
+        with held(order.folder, LEASE):
+            _spare(order)
+            Journal(order.folder).once(order.stage())
     except Exception as error:  # whatever it is, other cells go on
         why = caught(order.folder, error)
         return Outcome(error=why, mistaken=isinstance(error, InputError))

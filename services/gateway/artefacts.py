@@ -1,7 +1,7 @@
 """Documents that jobs wrote into shared storage, read for the pages: within limits, and cached."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -102,19 +102,16 @@ def of_job(kind: Kind[T], job: Job, shared: Path) -> list[Artefact[T]]:
     return [_artefact(kind, job, folder, name) for name in _names(folder, kind.file)]
 
 
-def ways(job: Job, names: Sequence[str]) -> list[tuple[str, str]]:
+def ways(job: Job, shared: Path) -> list[tuple[str, str]]:
     """Titles and paths of the pages that show what a job wrote.
 
     Args:
       job: the job.
-      names: of its artefacts.
+      shared: root of the shared storage.
     """
-    told = [
-        (kind.title, f"/{kind.path}/{job.id}")
-        for kind in KINDS
-        if any(PurePosixPath(name).name == kind.file and name.count("/") < 2 for name in names)
-    ]
-    return told + ([("Report", f"/reports/{job.id}/{REPORT}")] if REPORT in names else [])
+    folder = folder_of(shared, job.id)
+    told = [(kind.title, f"/{kind.path}/{job.id}") for kind in KINDS if _names(folder, kind.file)]
+    return told + ([("Report", f"/reports/{job.id}/{REPORT}")] if folder.file(REPORT) else [])
 
 
 def _names(folder: JobFolder, file: str) -> list[str]:

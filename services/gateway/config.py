@@ -105,7 +105,7 @@ class Config:
     @property
     def shelves(self) -> dict[str, Path]:
         """Folders of recordings that pages show."""
-        told = {"lab": Path(self.recordings).expanduser()} if self.recordings else {}
+        told = {"lab": Path(self.recordings)} if self.recordings else {}
         return told | {"robots": self.data / "recordings"}
 
     @property
@@ -124,7 +124,9 @@ class Config:
                 read[name] = value
         if "data" in read:
             base = file.parent if file and PREFIX + "DATA" not in os.environ else Path()
-            read["data"] = base / Path(read["data"]).expanduser()
+            read["data"] = base / _home("data", read["data"])
+        if read.get("recordings"):
+            read["recordings"] = str(_home("recordings", read["recordings"]))
         config = replace(self, **read)
         if not config.link.startswith("tcp://"):
             raise InputError(f"link: {config.link[:40]!r} is no address such as {Config.link}")
@@ -141,10 +143,20 @@ class Config:
         return config
 
 
+def _home(name: str, value: str) -> Path:
+    """A path that may begin with `~`."""
+    try:
+        return Path(value).expanduser()
+    except RuntimeError as error:
+        raise InputError(
+            f"{name}: {value[:60]!r} begins with nobody's home folder here; give it in full"
+        ) from error
+
+
 def _number(name: str, value: Any) -> int:
     least, most = NUMBERS[name]
     try:
-        number = least - 1 if isinstance(value, bool) else int(value)
+        number = least - 1 if isinstance(value, bool | float) else int(value)
     except (TypeError, ValueError):
         number = least - 1
     if not least <= number <= most:

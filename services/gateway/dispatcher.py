@@ -171,22 +171,29 @@ class Dispatcher:
                 await on_storage(self._check, job)
                 await on_storage(self._order, job, 0)
             except OSError as error:
-                told = f"the shared storage takes no files ({error.strerror or error})"
-                raise NoJobsError(told) from error
+                raise NoJobsError(_full(error)) from error
             detail = {"verb": job.verb, "arguments": list(job.arguments)}
             await self._write(job, Event("submitted", job.who, detail=detail))
         return job, True
 
     async def cancel(self, name: str, who: str) -> Job:
-        """Call a job off; nothing of it goes on, whether Ray answers or not."""
+        """Call a job off; nothing of it goes on, whether Ray answers or not.
+
+        Raises:
+          TrialError: it has ended.
+          NoJobsError: its process is yet to be told, as soon as the shared storage takes files.
+        """
         async with self._locks[name]:
             job = self.job(name)
             if not job.open:
                 raise TrialError(f"{name} has {job.state}")
             if (now := job.cancel(who)) != job:
                 await self._write(now, Event("cancelled", who))
-                if now.open:
+            if now.open:
+                try:
                     await on_storage(folder_of(self.shared, name).revoke)
+                except OSError as error:
+                    raise NoJobsError(f"{name} is called off, but {_full(error)}") from error
         await self._look(name)
         return self.job(name)
 
@@ -230,7 +237,11 @@ class Dispatcher:
                 if job.state is JobState.QUEUED:
                     await self._attempt(job)
                 elif job.open:
-                    await self._follow(job)
+                    try:
+                        await self._follow(job)
+                    finally:  # again: the storage may have taken nothing when it was called off
+                        if self.jobs[name].state is JobState.CANCELLING:
+                            await on_storage(folder_of(self.shared, name).revoke)
         except OSError as error:
             self._failed = f"the shared storage, which takes no files ({error.strerror or error})"
         except RayAwayError as error:
@@ -335,6 +346,10 @@ def _named(job: Job, key: str | None) -> Job:
     told = f"{job.who}\n{key}".encode()
     digest = secrets.token_hex(6) if key is None else hashlib.sha256(told).hexdigest()[:12]
     return replace(job, id=f"job-{digest}")
+
+
+def _full(error: OSError) -> str:
+    return f"the shared storage takes no files ({error.strerror or error})"
 
 
 def _submission(job: Job) -> str:

@@ -2,7 +2,8 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import suppress
 from itertools import islice
 from typing import Annotated, Any
 
@@ -21,12 +22,13 @@ from services.gateway.records import Row, job_document
 from services.gateway.shapes import WITHOUT_FRACTION, Retry, Strict
 from services.gateway.storage import on_storage
 from services.job_arguments import COUNT, LENGTH, Verb
+from services.job_folder import turn
 
 CHUNK = 2**16
 FOLLOW = 0.5
 """Between two looks at the log of a job that runs, s."""
 ARTIFACTS = 10_000
-"""Artefacts of a job that are listed."""
+"""Artefacts of a job on a page of their list."""
 
 JobName = Annotated[str, Path(pattern=names.WHOLE, description="Id of a job.")]
 Viewer = Annotated[User, needs(Role.VIEWER)]
@@ -97,9 +99,10 @@ class ArtifactShape(BaseModel):
 
 
 class ArtifactList(BaseModel):
-    """What a job wrote."""
+    """A page of what a job wrote; `next` goes on where it is given as `after`."""
 
     artifacts: list[ArtifactShape]
+    next: str | None
 
 
 def dispatcher_of(request: Request) -> Dispatcher:
@@ -115,23 +118,26 @@ async def document(dispatcher: Dispatcher, job: Job) -> Row:
     return job_document(job) | {"waits_for": dispatcher.waits_for(job), "progress": progress}
 
 
-async def artifacts(dispatcher: Dispatcher, job: Job) -> list[Row]:
-    """What a job wrote, by name."""
+async def artifacts(
+    dispatcher: Dispatcher, job: Job, limit: int = ARTIFACTS, after: str = ""
+) -> tuple[list[Row], str | None]:
+    """What a job wrote, a page at a time, and the last name of the page where there are more."""
 
-    def listed() -> list[Row]:
+    def told() -> Iterator[Row]:
         folder = dispatcher.folder(job.id)
         done = job.state is JobState.SUCCEEDED
         outcome = folder.outcome(job.last.number) if done else None
         digests = outcome.artifacts if outcome else {}
-        told = []
-        for name, path in islice(folder.files(), ARTIFACTS):
-            status = path.stat()
-            size, modified = status.st_size, status.st_mtime
-            row = {"name": name, "bytes": size, "modified": modified, "sha256": digests.get(name)}
-            told.append(row)
-        return told
+        for name, path in folder.files():
+            if after and turn(name) <= turn(after):
+                continue
+            with suppress(OSError):  # it was removed since it was found
+                status = path.stat()
+                row = {"name": name, "bytes": status.st_size, "modified": status.st_mtime}
+                yield row | {"sha256": digests.get(name)}
 
-    return await on_storage(listed)
+    found = await on_storage(lambda: list(islice(told(), limit + 1)))
+    return found[:limit], found[limit - 1]["name"] if len(found) > limit else None
 
 
 @router.get("/jobs", response_model=JobList, responses=READ)
@@ -231,10 +237,19 @@ async def get_logs(
 
 
 @router.get("/jobs/{job:name}/artifacts", response_model=ArtifactList, responses=READ)
-async def list_artifacts(request: Request, _: Viewer, job: JobName) -> Response:
-    """What a job wrote, by name."""
+async def list_artifacts(
+    request: Request,
+    _: Viewer,
+    job: JobName,
+    limit: Annotated[int, Query(ge=1, le=ARTIFACTS)] = ARTIFACTS,
+    after: Annotated[
+        str, Query(max_length=4096, description="The last name of the page before.")
+    ] = "",
+) -> Response:
+    """What a job wrote, a page at a time: files of a folder by name, then those of its folders."""
     dispatcher = dispatcher_of(request)
-    return as_json({"artifacts": await artifacts(dispatcher, dispatcher.job(job))})
+    told, more = await artifacts(dispatcher, dispatcher.job(job), limit, after)
+    return as_json({"artifacts": told, "next": more})
 
 
 @router.get(

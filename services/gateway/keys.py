@@ -19,7 +19,7 @@ import zmq
 import zmq.auth
 
 from pup.errors import InputError
-from pup.files import read_json, write_json
+from pup.files import read_json, write_atomic, write_json
 from services.gateway.names import is_name
 
 log = logging.getLogger(__name__)
@@ -62,6 +62,7 @@ class Tokens:
         self.file = file
         self._read_at: tuple[int, int] | None = None
         self._known: list[tuple[bytes, User]] = []
+        self._trouble = ""
 
     def user(self, token: str) -> User | None:
         """Whose token it is; all are compared, each in constant time."""
@@ -110,17 +111,22 @@ class Tokens:
         self.file.chmod(0o600)
 
     def _refresh(self) -> None:
+        """Read the file if it changed; while it cannot be read, who was let in still is."""
         try:
             status = self.file.stat()
+            if (at := (status.st_mtime_ns, status.st_ino)) != self._read_at:
+                self._known = [
+                    (bytes.fromhex(e["sha256"]), User(name, Role[e["role"].upper()]))
+                    for name, e in self._stored().items()
+                ]
+                self._read_at = at
+            self._trouble = ""
         except FileNotFoundError:
-            self._known = []
-            return
-        if (at := (status.st_mtime_ns, status.st_ino)) != self._read_at:
-            self._known = [
-                (bytes.fromhex(e["sha256"]), User(name, Role[e["role"].upper()]))
-                for name, e in self._stored().items()
-            ]
-            self._read_at = at
+            self._known, self._read_at = [], None
+        except (InputError, OSError) as error:
+            if (why := str(error)) != self._trouble:
+                log.error("tokens cannot be read; those of before hold", extra={"why": why})
+            self._trouble = why
 
 
 @dataclass(frozen=True)
@@ -181,11 +187,18 @@ class KeyRing:
         secret, public = out / f"{name}.key_secret", out / "gateway.key"
         if secret.exists():
             raise InputError(f"{secret}: exists; use another folder")
+        if out.resolve() == self.agents_folder.resolve():
+            raise InputError(f"{out}: is where agents are let in; use another folder")
         self.gateway()
         _create(out, name)
-        self.agents_folder.mkdir(parents=True, exist_ok=True)
-        os.replace(out / f"{name}.key", self.agents_folder / f"{name}.key")
-        public.write_bytes((self.folder / "gateway.key").read_bytes())
+        made, known = out / f"{name}.key", self.agents_folder / f"{name}.key"
+        try:
+            public.write_bytes((self.folder / "gateway.key").read_bytes())
+            write_atomic(known, made.read_bytes())  # a copy: it may be another file system
+        except OSError:
+            secret.unlink()  # else it would be in the way when this is repeated
+            raise
+        made.unlink()
         return secret, public
 
     def revoke_agent(self, name: str) -> None:

@@ -135,7 +135,7 @@ async def one_job(request: Request, job: str) -> Response:
         return login()
     dispatcher = job_routes.dispatcher_of(request)
     found = dispatcher.job(job)
-    files = await job_routes.artifacts(dispatcher, found)
+    files, more = await job_routes.artifacts(dispatcher, found, ARTIFACTS)
     name = part(request, "job.html", "job_live.html")
     return page(
         name,
@@ -144,9 +144,9 @@ async def one_job(request: Request, job: str) -> Response:
         job=await job_routes.document(dispatcher, found),
         open=found.open,
         mine=job_routes.may(user, found),
-        ways=ways(found, [file["name"] for file in files]),
-        artifacts=files[:ARTIFACTS],
-        more=len(files[ARTIFACTS:]),
+        ways=await on_storage(ways, found, dispatcher.shared),
+        artifacts=files,
+        more=more,
         log=await on_storage(dispatcher.folder(job).tail, LOG),
     )
 
