@@ -20,7 +20,7 @@ from benchmarks.paired import CORES, ROBOT
 from pup.locomotion.evaluation import Walks
 from pup.locomotion.landscape import walk_each
 from pup.locomotion.sampling import ParameterSampler
-from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.settings import TaskSettings
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
 from pup.sysid.result import FittedBounds, read_bounds
@@ -39,8 +39,7 @@ class Trial:
 
     def __init__(self, policy: NumpyPolicy, robot: RobotDescription, bounds: FittedBounds) -> None:
         self.policy, self.robot, self.bounds = policy, robot, bounds
-        direction = Direction(policy.card.direction)
-        self.settings = TaskSettings.of(robot, direction).evaluation()
+        self.settings = TaskSettings.of_policy(robot, policy.card).evaluation()
 
     def walks(self, mu: Array, condition: Array, seed: int) -> Walks:
         """One episode for each row of mu, on the unit scale, and its condition."""

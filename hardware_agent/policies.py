@@ -45,14 +45,22 @@ class Shelf:
         """A policy; the last one is kept.
 
         Raises:
-          InputError: it is not there, or not of this robot.
+          InputError: it is not there, or not of this robot as it is described here.
         """
         if self._loaded is not None and self._loaded[0] == digest:
             return self._loaded[1]
         for path, found in self._readable():
             if found == digest:
-                self._loaded = digest, NumpyPolicy.load(path, self._robot)
-                return self._loaded[1]
+                policy = NumpyPolicy.load(path, self._robot)
+                if policy.card.robot_digest != self._robot.digest:
+                    log.info(
+                        "policy %s: trained on another description of %s, a corrected one say; "
+                        "limits and gait agree",
+                        path.name,
+                        self._robot.name,
+                    )
+                self._loaded = digest, policy
+                return policy
         raise InputError(
             f"{self._folder}: no policy with digest {digest[:16]}; copy its bundle here"
         )

@@ -158,6 +158,7 @@ class _Job:
         problem = _seen(self._whole(actuator, self.known.get(actuator)))
         if not problem.free:
             raise InputError("nothing to fit: no parameter changes what the recordings measure")
+        problem.check()
         return problem
 
     def _whole(self, actuator: Actuator, known: ParameterSpace | None = None) -> Problem:

@@ -20,7 +20,7 @@ from pup.errors import InputError
 from pup.files import read_json, sha256, write_atomic, write_json
 from pup.locomotion.landscape import walk_each
 from pup.locomotion.sampling import ParameterSampler
-from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.settings import TaskSettings
 from pup.policy.bundle import CARD, NumpyPolicy
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
@@ -95,7 +95,7 @@ def rehearse(
     if rate is None:
         rate = recorded_rate(study.parent, walked.recordings, robot) or bundle.card.rates[1]
     bundle.card.check_rate(rate)
-    task = TaskSettings.of(robot, Direction(bundle.card.direction)).evaluation(rate)
+    task = TaskSettings.of_policy(robot, bundle.card).evaluation(rate)
     # The error of an IMU is drawn anew for each walk in a training; a robot has the one it has.
     task = replace(task, horizon=walked.horizon, tilt_bias=0.0)
     eta = np.repeat(walked.eta, EPISODES, axis=0)

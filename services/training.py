@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pup.errors import InputError
 from pup.files import sha256, write_json
 from pup.locomotion.engines import check_size
-from pup.locomotion.sampling import MARGIN, ParameterSampler
-from pup.locomotion.settings import TaskSettings
+from pup.locomotion.sampling import ParameterSampler
 from pup.locomotion.standing import check_start
 from pup.locomotion.task import WalkingTask
 from pup.physics.engine import Engine
@@ -36,7 +35,7 @@ from services.failures import FailedError
 from services.first_gait import FirstGait, Said, read_gait
 from services.provenance import ALSO, engine, now
 from services.tracking import Trackers
-from services.training_options import Options
+from services.training_options import Options, task_settings
 from workers.ppo import Iteration, Setup, Trainer, runners_before
 from workers.rollouts import Sampling
 from workers.walking import Walking
@@ -107,7 +106,7 @@ class _Job:
             )
         self.bounds = read_bounds(self.source, robot)
         self.bounds_sha256 = sha256(self.source)
-        self.settings = TaskSettings.of(robot, options.direction)
+        self.settings = task_settings(robot, options)
         nominal = options.method == Method.NOMINAL
         check_size(options.engine, options.simulations)
         self.walking = Walking(robot, self.bounds, self.settings, nominal, options.engine)
@@ -128,6 +127,7 @@ class _Job:
             options.learning,
             iterations=math.ceil(options.steps / self._per_iteration(options.runners)),
             seed=options.seed,
+            discount=options.learning.discount ** (1 / self.settings.tempo),
             mirror=self._mirror(task),
         )
         self.kept = Checkpoint(out / "checkpoint.npz", self._digest())
@@ -251,7 +251,8 @@ class _Job:
             "engine": engine(ALSO),
             "written": now(),
         }
-        mu = np.random.default_rng(0).uniform(-MARGIN, 1 + MARGIN, (ETAS, len(self.bounds.names)))
+        noise, sampler = self.settings.parameter_noise, ParameterSampler(self.bounds)
+        mu = sampler.told(np.random.default_rng(0), ETAS, noise)
         eta = NumpyPolicy(self.card, weights).project(mu)
         card = replace(
             self.card,

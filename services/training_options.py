@@ -5,10 +5,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pup.errors import InputError
-from pup.locomotion.settings import Direction
+from pup.locomotion.settings import Direction, TaskSettings
 from pup.physics.engine import Engine
+from pup.policy.bundle import read_bundle
 from pup.policy.losses import LossWeights
 from pup.policy.shape import Method
+from pup.robot import RobotDescription
 from workers.learner import Learning
 
 SHARPEN = 2.5
@@ -30,7 +32,8 @@ class Options:
       seed: of everything random.
       simulations: at once, of each process that samples.
       length: control steps of each between two updates.
-      learning: how the networks are moved; what follows from the rest is filled in.
+      learning: how the networks are moved; what follows from the rest is filled in. The discount
+        is of a control step of the paper's robot.
       runners: processes that sample; 0 for none beside this one.
       start: bundle whose weights are trained further, perhaps of other bounds or parameters;
         None draws weights.
@@ -58,6 +61,18 @@ def usual_learning(start: Path | None, pattern: int) -> Learning:
     """How the networks are moved unless told otherwise; see `Options` for what it begins with."""
     walks = start is not None or pattern > 0
     return Learning(rate=WALKING_RATE if walks else RATE, sharpen=SHARPEN if start is None else 1.0)
+
+
+def task_settings(robot: RobotDescription, options: Options) -> TaskSettings:
+    """The task of a training; a policy that is trained further keeps its smoothing.
+
+    Raises:
+      InputError: the first policy cannot be read or is another robot's.
+    """
+    settings = TaskSettings.of(robot, options.direction)
+    if options.start is None:
+        return settings
+    return replace(settings, smoothing=read_bundle(options.start, robot)[0].smoothing)
 
 
 def training_options(given: argparse.Namespace) -> Options:

@@ -90,11 +90,9 @@ class Gateway:
         while True:
             try:
                 answer = self.http.request(method, path, **options)
-                later = "Retry-After" in answer.headers
-                if not later and (answer.status_code < 500 or _is_problem(answer)):
+                if not (why := away(answer)):
                     break
-                self.met = self.met or later
-                why = _detail(answer) if later else f"it answers {answer.status_code}"
+                self.met = self.met or "Retry-After" in answer.headers
             except httpx.HTTPError as error:
                 why = str(error) or type(error).__name__
             except ValueError as error:  # a key beyond ASCII, a number that JSON does not know
@@ -109,20 +107,25 @@ class Gateway:
             pause = min(2 * pause, 5.0)
         self.met = True
         if answer.status_code >= 400:
-            raise InputError(f"{self.url}: {_detail(answer)}")
+            raise InputError(f"{self.url}: {detail(answer)}")
         try:
             return answer.json()
         except ValueError as error:
             raise InputError(f"{self.url}: not a gateway of pup; its answer is no JSON") from error
 
 
-def _is_problem(answer: httpx.Response) -> bool:
-    """Whether the gateway itself says that it cannot; waiting would not help."""
+def away(answer: httpx.Response) -> str:
+    """Why an answer is none yet, in words; empty where it is one, or waiting would not help."""
+    if "Retry-After" in answer.headers:
+        return detail(answer)
+    # The gateway itself says by a problem that it cannot; what stands before it does not.
     kind = answer.headers.get("content-type", "")
-    return answer.status_code == 503 and kind == "application/problem+json"
+    itself = answer.status_code == 503 and kind == "application/problem+json"
+    return "" if answer.status_code < 500 or itself else f"it answers {answer.status_code}"
 
 
-def _detail(answer: httpx.Response) -> str:
+def detail(answer: httpx.Response) -> str:
+    """What an answer says of an error."""
     try:
         told = answer.json()
         return str(told["detail"]) or str(told["title"])

@@ -14,7 +14,7 @@ from pup.locomotion.conditioning import fitted_eta
 from pup.locomotion.evaluation import evaluate
 from pup.locomotion.landscape import landscape
 from pup.locomotion.sampling import ParameterSampler
-from pup.locomotion.settings import Direction, TaskSettings
+from pup.locomotion.settings import TaskSettings
 from pup.locomotion.task import WalkingTask
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
@@ -74,7 +74,7 @@ def walk(robot: RobotDescription, shown: Shown, out: Path, threads: int) -> dict
     eta = None if shown.eta is None else _eta(policy, shown.eta)
     if shown.landscape and not policy.card.shape.eta:
         raise InputError(f"{shown.policy}: is conditioned on nothing; leave --landscape out")
-    settings = TaskSettings.of(robot, Direction(policy.card.direction)).evaluation()
+    settings = TaskSettings.of_policy(robot, policy.card).evaluation()
     rate = shown.rate or policy.card.rates[1]
     policy.card.check_rate(rate)
 

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from hardware_agent.control import say
-from pup.policy.bundle import PolicyCard, write_bundle
+from pup.policy.bundle import PolicyCard, read_bundle, write_bundle
 from pup.policy.shape import Method, PolicyShape
 from pup.robot import Gait, Harmonics, RobotDescription
 
@@ -151,6 +153,18 @@ def standing(**others: Harmonics) -> Gait:
     return replace(gait, joints=joints)
 
 
+def described(folder: Path, gait: Gait) -> Path:
+    """A Darwin OP2 with another reference, for policies that were trained on that one."""
+    left = shutil.ignore_patterns("recordings", "policies")
+    shutil.copytree(DARWIN.folder, folder, ignore=left, dirs_exist_ok=True)
+    document: Any = tomlkit.parse((folder / "robot.toml").read_text())
+    document["gait"]["joints"] = {
+        name: {"c0": c0, "a": list(a), "b": list(b)} for name, (c0, a, b) in gait.joints.items()
+    }
+    (folder / "robot.toml").write_text(tomlkit.dumps(document))
+    return folder
+
+
 @dataclass
 class Lab:
     """A virtual robot and where the agent's files are.
@@ -237,6 +251,8 @@ def lab(
 ) -> Iterator[Lab]:
     """A virtual robot with a configuration for its agent.
 
+    The agent knows it by the gait of the policies that are there already.
+
     Args:
       folder: for everything.
       speed: of its time; 0 for lock-step.
@@ -246,6 +262,9 @@ def lab(
     """
     clock = "wall" if speed else "lockstep"
     text = CONFIG.format(folder=folder, protocol=protocol, clock=clock)
+    for policy in folder.glob("policies/*"):
+        robot_folder = described(folder / "robot", read_bundle(policy)[0].gait)
+        text = text.replace('robot = "darwin_op2"', f'robot = "{robot_folder}"')
     (folder / "agent.toml").write_text(changed(text, more))
     command = [sys.executable, "-m", "services.cli", "virtual-robot", "--seed", str(seed)]
     command += ["--link", str(folder / "bus"), "--imu", str(folder / "imu")]

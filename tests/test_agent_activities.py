@@ -1,6 +1,7 @@
 """When a robot is on its own feet, so that a large tilt is a fall."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from hardware_agent.policies import Shelf
 from hardware_agent.recordings import Recordings
 from hardware_agent.rollout import Rollout, row_names
 from hardware_agent.senses import Senses
+from pup.errors import InputError
 from pup.policy.bundle import CARD
 from pup.wire import Assign
 
@@ -44,19 +46,39 @@ def senses(time: float, pose: np.ndarray) -> Senses:
     )
 
 
+STANDS = replace(DARWIN, gait=standing())
+
+
 @pytest.fixture
 def rollout(tmp_path: Path) -> Rollout:
     bundle(tmp_path / "policies" / "still", standing())
-    shelf = Shelf(tmp_path / "policies", DARWIN)
+    shelf = Shelf(tmp_path / "policies", STANDS)
     return Rollout(shelf.load(shelf.policies()[0].sha256), (0.0, 0.0, 0.0), 33)
 
 
 def test_a_bundle_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
     bundle(tmp_path / "policies" / "still", standing())
     (tmp_path / "policies" / "broken" / CARD).mkdir(parents=True)
-    shelf = Shelf(tmp_path / "policies", DARWIN)
+    shelf = Shelf(tmp_path / "policies", STANDS)
     (told,) = shelf.policies()
     assert told.name == "still" and shelf.load(told.sha256)
+
+
+def test_a_policy_of_another_description_is_refused_or_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Refused where the numbers of its joints may mean something else."""
+    caplog.set_level("INFO", "pup-agent")
+    bundle(tmp_path / "still", standing())
+    shelf = Shelf(tmp_path, DARWIN)
+    (told,) = shelf.policies()
+    with pytest.raises(InputError, match=r"trained on .* other gait\.joints; "):
+        shelf.load(told.sha256)
+    assert Shelf(tmp_path, STANDS).load(told.sha256) and not caplog.messages
+    corrected = Shelf(tmp_path, replace(STANDS, digest="0" * 64))
+    assert corrected.load(told.sha256) is corrected.load(told.sha256)
+    (line,) = caplog.messages
+    assert line.startswith("policy still: trained on another description of darwin_op2")
 
 
 def test_a_recording_that_cannot_be_made_ends_nothing(tmp_path: Path) -> None:

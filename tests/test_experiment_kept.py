@@ -1,7 +1,6 @@
 """What an experiment has found is not deleted for a mistake, nor by two processes at once."""
 
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import agents
 import pytest
 from commandline import pup
+from jobs import holder
 from workshops import Workshop, do, opened, told
 
 from pup.errors import InputError
@@ -17,8 +17,7 @@ from services.experiment.cells import graph
 from services.experiment.inputs import different
 from services.experiment.plan import Plan, small
 from services.experiment.run import CELLS, FILES, run_again
-from services.failures import FailedError
-from services.held import LOCK, held
+from services.held import LOCK
 
 STAGES = ("--stages", "policy", "--local", "--json")
 
@@ -132,14 +131,8 @@ def test_what_is_other_is_named(name: str) -> None:
 @pytest.fixture
 def elsewhere(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """Another process that has the folder."""
-    code = "import sys; from pathlib import Path; from services.held import held\n"
-    code += "with held(Path(sys.argv[1])): print(flush=True); sys.stdin.read()"
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
-        assert process.stdout is not None and process.stdout.readline()
+    with holder(tmp_path) as process:
         yield process
-        process.kill()
 
 
 def test_two_processes_do_not_work_in_one_folder(
@@ -155,16 +148,6 @@ def test_two_processes_do_not_work_in_one_folder(
     elsewhere.wait()
     assert pup(*asked).code == 0 and len(workshop.done) == 2
     assert not (tmp_path / LOCK).exists()
-
-
-def test_a_folder_is_free_again_whatever_happened(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), held(tmp_path):
-        with pytest.raises(FailedError, match="another process"), held(tmp_path):
-            pass
-        raise KeyboardInterrupt
-    with held(tmp_path):
-        pass
-    assert not list(tmp_path.iterdir())
 
 
 def test_policies_that_are_not_there_are_not_trained_instead(tmp_path: Path) -> None:

@@ -278,6 +278,31 @@ def test_the_document_and_the_report_tell_what_was_found(
     assert estimated(ratios["pup / robust"]) in page.text
 
 
+def test_an_infeasible_trial_keeps_its_number(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Or what comes after it would have needed a trial less. What gave no result has none."""
+    cells = graph(small())
+    name = "trials-r1000-forward-pup"
+    with made_up(monkeypatch):
+        assert do(cells, tmp_path) == {}
+    file = tmp_path / CELLS / name / FILES / "result.json"
+    document = json.loads(file.read_text())
+    first, *others = document["result"]["walks"]
+    nowhere = first | {"state": "infeasible", "distance": None}
+    lost = first | {"state": "lost", "distance": None}
+    document["result"]["walks"] = [nowhere, lost, first | {"distance": 9.0}, *others]
+    write_json(file, document)
+    document = gather(small(), cells, {}, tmp_path)
+    write_json(tmp_path / "experiment.json", document)
+    part = document["directions"]["forward"]
+    far = [w["distance"] for w in others]
+    assert part["searches"]["pup"]["r1000"] == [None, 9.0, *far]
+    assert part["statistics"]["needed"]["pup"]["robots"]["r1000"] == 2
+    with np.errstate(all="raise"):  # of infinities in figures
+        write_report(document, tmp_path / "report.html")
+
+
 def test_an_experiment_that_is_only_begun_is_reported_too(tmp_path: Path) -> None:
     cells = graph(small())
     failed = dict.fromkeys(cells, "needs record-r1000")

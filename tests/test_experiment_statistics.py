@@ -122,6 +122,11 @@ def test_a_ratio_to_what_may_be_nothing_has_no_upper_end():
     assert both.document()["ci90"] == [None, None]
 
 
+def test_infeasible_trials_count_and_come_nowhere():
+    assert best_so_far([None, -0.3, None, 0.5]) == [-np.inf, -0.3, -0.3, 0.5]
+    assert needed(best_so_far([None, -0.3, None, 0.5]), -1.0) == 2
+
+
 @given(st.lists(NUMBERS, min_size=1, max_size=30), NUMBERS)
 def test_trials_that_are_needed(distances, goal):
     best, first = best_so_far(distances), needed(distances, goal)

@@ -59,11 +59,12 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
     """An experiment on policies that stand for a while, without the diagnosis."""
     folder = tmp_path_factory.mktemp("experiment")
     (folder / "plan.toml").write_text(PLAN)
-    names = read_bounds(DARWIN.identified_path, DARWIN).names
+    names, gait = read_bounds(DARWIN.identified_path, DARWIN).names, agents.standing()
     for method in (Method.PUP, Method.ROBUST):
         place = folder / "policies" / "forward" / method
-        agents.bundle(place, agents.standing(), names, lively=True, method=method)
-    given = ("--plan", folder / "plan.toml", "--policies", folder / "policies")
+        agents.bundle(place, gait, names, lively=True, method=method)
+    robot = agents.described(folder / "darwin_op2", gait)
+    given = ("--robot", robot, "--plan", folder / "plan.toml", "--policies", folder / "policies")
     return ("experiment", *given, "--stages", "record,presysid,trials,prior", "--local")
 
 

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from walking import BOUNDS, DARWIN
+from walking import BOUNDS, DARWIN, walking
 
 from pup.errors import InputError
-from pup.locomotion.sampling import ParameterSampler
+from pup.locomotion.sampling import MARGIN, ParameterSampler
+from pup.locomotion.settings import TaskSettings
 from pup.sysid.result import read_bounds
 
 
@@ -60,6 +61,24 @@ def test_the_unit_scale_has_an_inverse_also_where_bounds_are_one(
     upper[list(pinned)] = BOUNDS.lower[list(pinned)]
     sampler = ParameterSampler(replace(BOUNDS, upper=upper))
     np.testing.assert_allclose(sampler.unit(sampler.physical(unit)), unit, atol=1e-12)
+
+
+def test_what_policies_are_told_in_trainings_spans_the_box_of_eta() -> None:
+    """Of a parameter whose bounds are one that is the error alone; of others all their bounds."""
+    upper = BOUNDS.upper.copy()
+    upper[3] = BOUNDS.lower[3]
+    noise = TaskSettings().parameter_noise
+    for bounds in (BOUNDS, replace(BOUNDS, upper=upper)):
+        sampler = ParameterSampler(bounds)
+        spanned = sampler.told(np.random.default_rng(0), 1000, noise)
+        heard = walking(TaskSettings(), 1000, sampler=sampler)
+        heard.reset()
+        told = heard.state()["episodes/told"]
+        np.testing.assert_allclose(spanned.min(axis=0), told.min(axis=0), atol=0.02)
+        np.testing.assert_allclose(spanned.max(axis=0), told.max(axis=0), atol=0.02)
+        every = np.random.default_rng(0).uniform(-MARGIN, 1 + MARGIN, spanned.shape)
+        same = bounds.upper > bounds.lower
+        np.testing.assert_array_equal(spanned[:, same], every[:, same])
 
 
 def test_a_parameter_whose_bounds_are_one_has_that_value_in_every_episode() -> None:

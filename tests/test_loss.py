@@ -9,6 +9,7 @@ from recordings import make
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.recording import Recording
 from pup.robot import RobotDescription
+from pup.sysid import loss as loss_module
 from pup.sysid.loss import FEET_WEIGHT, LOST_FOOT, LOST_POSITION, TILT_WEIGHT, ReplayLoss
 
 TIME = [0.0, 0.1, 0.2]
@@ -19,6 +20,13 @@ class Robot:
     """All that the loss asks of a robot."""
 
     joint_names = ("a", "b")
+    feet = ("left", "right")
+
+
+@pytest.fixture(autouse=True)
+def turning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no model to tell that its joints turn; of those that slide see test_loss_units."""
+    monkeypatch.setattr(loss_module, "joint_units", lambda robot: np.ones(len(robot.joint_names)))
 
 
 def loss_of(*recordings: Recording) -> ReplayLoss:

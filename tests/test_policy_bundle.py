@@ -13,13 +13,16 @@ from pup.errors import InputError
 from pup.policy.bundle import NumpyPolicy, PolicyCard, read_bundle, write_bundle
 from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method
-from pup.robot import RobotDescription
+from pup.robot import RobotDescription, TermSpec
+from pup.robot_writer import write_corrected
 
 torch = pytest.importorskip("torch")
 
 from policies import COURSE, ROBOT, card_of, observations, policy_of, weights_of  # noqa: E402
 
 from pup.policy.network import ProjectedPolicy, expected  # noqa: E402
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "policies"
 
 
 @pytest.fixture
@@ -196,6 +199,53 @@ def test_a_bundle_of_another_robot_is_refused(bundle: Path) -> None:
     """By its joints too."""
     refused(bundle, "'darwin_op2'", "'servo_bench'", robot=RobotDescription.load("servo_bench"))
     refused(bundle, "20 joints", robot=replace(ROBOT, joints=ROBOT.joints[::-1]))
+
+
+def moved(robot: RobotDescription, count: int) -> RobotDescription:
+    """With other limits of its first joints."""
+    first = (replace(joint, upper=joint.upper - 0.1) for joint in robot.joints[:count])
+    return replace(robot, joints=(*first, *robot.joints[count:]))
+
+
+GAIT = ROBOT.gait
+assert GAIT is not None
+OTHER = {
+    "a limit": (moved(ROBOT, 1), "other limits of l_sho_pitch; "),
+    "many limits": (moved(ROBOT, 5), "limits of l_el and more; "),
+    "an offset": (
+        replace(ROBOT, gait=replace(GAIT, imu_pitch_offset=0.0)),
+        "other gait.imu_pitch_offset; ",
+    ),
+    "both": (
+        moved(replace(ROBOT, gait=replace(GAIT, period=0.5)), 1),
+        "other limits of l_sho_pitch, gait.period; ",
+    ),
+    "no gait": (replace(ROBOT, gait=None), "other gait.period, gait.joints, "),
+}
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_a_policy_runs_no_robot_that_was_described_otherwise(bundle: Path, name: str) -> None:
+    """It may be trained further for one."""
+    robot, words = OTHER[name]
+    with pytest.raises(InputError, match=r"policy\.json: trained on .* --start") as told:
+        NumpyPolicy.load(bundle, robot)
+    assert words in str(told.value)
+    assert read_bundle(bundle, robot)
+
+
+def test_a_policy_runs_a_robot_that_was_corrected(bundle: Path, tmp_path: Path) -> None:
+    """By a diagnosis, which writes other parameters and terms."""
+    term = TermSpec("backlash", "joint", "l_knee", {"gap": 0.02})
+    nominal = {ROBOT.parameters[0].name: ROBOT.parameters[0].nominal * 1.1}
+    robot = write_corrected(ROBOT, tmp_path / "corrected", nominal, (term,))
+    assert robot.digest != ROBOT.digest and robot.terms
+    assert NumpyPolicy.load(bundle, robot).card == NumpyPolicy.load(bundle, ROBOT).card
+
+
+def test_the_policies_that_come_with_pup_run_their_robots() -> None:
+    shipped = [*ROBOT.folder.glob("policies/*"), *EXAMPLES.glob("*/*/")]
+    assert len([NumpyPolicy.load(folder, ROBOT) for folder in shipped]) == 11
 
 
 def test_targets_are_those_of_the_task(bundle: Path) -> None:

@@ -16,6 +16,7 @@ from pup.physics.parameters import robot_space
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
+from pup.sysid import problem as problems
 from pup.sysid.fit import FitResult
 from pup.sysid.result import Bounds, fitted_to, read_fitted
 from services import presysid
@@ -107,6 +108,16 @@ def test_where_nothing_was_read_there_is_nothing_to_fit(
     job, _ = job_of(robot, (unread("a"), unread("b")), tmp_path, Options("pd"))
     with pytest.raises(InputError, match="nothing to fit: no parameter changes"):
         job._problem("pd")
+
+
+def test_recordings_longer_than_the_memory_are_refused_before_any_fit(
+    robot: RobotDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(problems, "_memory", lambda: 1000)
+    job, runner = job_of(robot, (stepped("a", "suspended"),) * 2, tmp_path, Options("pd"))
+    with pytest.raises(InputError, match="give fewer or shorter recordings"):
+        job.run()
+    assert not runner.fits
 
 
 def test_a_subset_that_sees_nothing_is_not_searched(

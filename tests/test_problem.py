@@ -12,7 +12,9 @@ from recordings import make
 from terms import BENCH, SERVO
 from test_simulator import recording
 
+from pup.errors import InputError
 from pup.physics.parameters import robot_space
+from pup.physics.simulator import Trajectories
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
 from pup.sysid import problem as problems
@@ -60,6 +62,39 @@ def test_losses_do_not_depend_on_how_many_are_in_memory(
         part = of_walker(walker, 12)
         assert part.at_once == at_once
         assert np.array_equal(part.losses(units), whole)
+
+
+def test_errors_do_not_depend_on_how_many_are_in_memory(
+    walker: RobotDescription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    units = np.random.default_rng(0).uniform(size=(7, 5))
+    whole = of_walker(walker, 12).errors(units)
+    replay, asked = Problem.replay, []
+
+    def counted(problem: Problem, unit: Array) -> Trajectories:
+        asked.append(len(unit))
+        return replay(problem, unit)
+
+    monkeypatch.setattr(problems, "MEMORY", 20_000)
+    monkeypatch.setattr(Problem, "replay", counted)
+    for told, expected in zip(of_walker(walker, 12).errors(units), whole, strict=True):
+        assert np.array_equal(told, expected)
+    assert asked == [3, 2, 2]
+
+
+def test_recordings_whose_slopes_do_not_fit_are_refused(
+    walker: RobotDescription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By as many numbers as there are: two joints, roll and pitch, and two feet."""
+    problem = of_walker(walker, 12)
+    errors, _ = problem.errors(np.full((5, 5), 0.5))
+    assert errors.shape[1] == 18 * problem.loss.numbers
+    monkeypatch.setattr(problems, "_memory", lambda: 3 * errors.nbytes)
+    problem.check()
+    monkeypatch.setattr(problems, "_memory", lambda: 3 * errors.nbytes - 1)
+    with pytest.raises(InputError, match="18 samples of 10 errors, by 5 parameters, take") as told:
+        problem.check()
+    assert "\n" not in str(told.value)
 
 
 def test_more_candidates_take_no_more_memory(
@@ -122,7 +157,7 @@ def test_the_physics_are_those_of_their_number(tmp_path: Path) -> None:
         "floor": on_the_floor(tmp_path),
     }
     losses = {name: float(case.losses(np.empty((1, 0)))[0]) for name, case in cases.items()}
-    assert (MODEL, losses) == (9, pytest.approx(GOLDEN, rel=1e-6)), (
+    assert (MODEL, losses) == (10, pytest.approx(GOLDEN, rel=1e-6)), (
         "the physics or the loss has changed: raise MODEL (pup/sysid/problem.py), and put its "
         f"number and {losses} here; where MuJoCo is another one, the losses alone"
     )

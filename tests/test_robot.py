@@ -433,3 +433,16 @@ def refused(folder: Path, words: str) -> None:
         RobotDescription.load(folder)
     assert "\n" not in str(error.value)
     assert str(folder) in str(error.value)
+
+
+def test_a_torso_that_is_not_first_in_its_world_is_refused(tmp_path: Path) -> None:
+    """Its free joint would not be where everybody looks for it; what comes later does no harm."""
+    left = '<body name="left"><joint name="l"/><geom size="0.1"/></body>'
+    torso, end = '<body name="trunk">', "</worldbody>"
+    apart = swap(left, "")(MODEL)
+    before = robot_folder(tmp_path / "before", model=swap(torso, left + torso)(apart))
+    with pytest.raises(InputError, match=r"'l' stands before .* torso 'trunk' first") as told:
+        compile_model(RobotDescription.load(before), "ground")
+    assert "\n" not in str(told.value)
+    after = robot_folder(tmp_path / "after", model=swap(end, left + end)(apart))
+    assert compile_model(RobotDescription.load(after), "ground").floating

@@ -1,6 +1,7 @@
 """Scripts as files: what is written is read again, and nothing that no robot could play."""
 
 import json
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from pup.sysid.scripts import scripts
 
 OP2 = RobotDescription.load("darwin_op2")
 ARM = RobotDescription.load("so101")
+QUADRUPED = RobotDescription.load(Path(__file__).parents[1] / "examples" / "quadruped")
 
 
 def small(**changes: object) -> dict[str, object]:
@@ -97,21 +99,49 @@ def test_a_file_that_is_large_or_no_json_is_refused(tmp_path: Path) -> None:
         Script.read(file)
 
 
-@pytest.mark.parametrize("robot", [OP2, ARM], ids=lambda robot: robot.name)
-def test_ways_lead_from_home_to_the_first_target_and_back(robot: RobotDescription) -> None:
+@pytest.mark.parametrize(
+    ("robot", "seed", "anew"),
+    [
+        (OP2, 3, []),
+        (ARM, 3, []),
+        # Straight ways, and those by a named pose, take a leg up to 10 mm into another.
+        (QUADRUPED, 5, ["step_0.3"]),
+        (QUADRUPED, 28, ["step_0.3"]),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_ways_lead_from_home_to_the_first_target_and_back(
+    robot: RobotDescription, seed: int, anew: list[str]
+) -> None:
+    """By motions as they were drawn, but for those that no free way leads to."""
     kinds = ("step:0.3", "hold", *(("standup:2", "fall:left") if robot.floating else ()))
-    made = scripts(robot, kinds, np.random.default_rng(3))
-    plain = script(robot, kinds, np.random.default_rng(3))
+    made = scripts(robot, kinds, np.random.default_rng(seed))
+    plain = script(robot, kinds, np.random.default_rng(seed))
     clearance = Clearance(robot)
-    for one, motion in zip(made, plain, strict=True):
-        np.testing.assert_array_equal(one.target, motion.target)
+    assert [one.id for one in made] == [motion.id for motion in plain]
+    other = [
+        m.id for o, m in zip(made, plain, strict=True) if not np.array_equal(o.target, m.target)
+    ]
+    assert other == anew
+    for one in made:
         assert len(json.dumps(one.document())) < LIMIT
-        np.testing.assert_array_equal(one.way[-1], motion.target[0])
+        np.testing.assert_array_equal(one.way[-1], one.target[0])
         np.testing.assert_array_equal(one.way[0], made[0].way[0])
-        assert one.falls == (motion.motion == "fall")
-        legs = [one.way] if one.falls else [one.way, np.array([motion.target[-1], *one.back])]
+        assert one.falls == (one.motion == "fall")
+        legs = [one.way] if one.falls else [one.way, np.array([one.target[-1], *one.back])]
         for poses in legs:
             for begin, end in pairwise(poses):
-                assert clearance.path_free(begin, end)
+                assert clearance.path_free(begin, end), one.id
         if not one.falls:
             np.testing.assert_array_equal(one.back[-1], one.way[0])
+
+
+def test_a_robot_without_a_free_way_is_refused(tmp_path: Path) -> None:
+    """As it waits in a pose in which a front leg stands in a hind one."""
+    folder = shutil.copytree(QUADRUPED.folder, tmp_path / "crossed")
+    home = dict.fromkeys(QUADRUPED.joint_names, -0.1) | {"fl_hip": 1.4, "hl_hip": -1.0}
+    lines = "".join(f"{name} = {angle}\n" for name, angle in home.items())
+    with (folder / "robot.toml").open("a") as file:
+        file.write(f"[poses.home]\n{lines}")
+    with pytest.raises(InputError, match=r"step_0\.1 and back; add a pose .* \[poses\]"):
+        scripts(RobotDescription.load(folder), ("step:0.1",), np.random.default_rng(0))

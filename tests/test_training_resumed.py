@@ -19,6 +19,7 @@ from pup.locomotion.settings import Direction
 from pup.physics.parameters import robot_space
 from pup.policy.bundle import NumpyPolicy
 from pup.policy.losses import LossWeights
+from pup.policy.network import ProjectedPolicy
 from pup.policy.shape import Method
 from pup.robot import RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
@@ -151,6 +152,22 @@ def test_what_is_done_has_a_policy(
         patched.setattr(training, "write_bundle", killed)
         job(tmp_path)
     assert job(tmp_path)["done"] and weights_of(tmp_path)
+
+
+def test_eta_is_searched_where_the_policy_was_trained(tmp_path: Path) -> None:
+    """UP's eta is mu: of a parameter whose bounds are one it was told by the error alone."""
+    told = json.loads(ROBOT.identified_path.read_text())
+    told["parameters"][0]["lower"] = told["parameters"][0]["upper"]
+    (tmp_path / "bounds.json").write_text(json.dumps(told))
+    options = replace(SMALL, method=Method.UP)
+    ignored = (lambda row, steps: None), (lambda *_: None)
+    made = training._Job(ROBOT, tmp_path / "bounds.json", options, tmp_path, *ignored)
+    made.rows = [{"steps": 1}]
+    policy = ProjectedPolicy(made.shape)
+    made._bundle("policy", {name: value.numpy() for name, value in policy.state_dict().items()})
+    card = NumpyPolicy.load(tmp_path / "policy", ROBOT).card
+    np.testing.assert_allclose(card.eta_lower, -1.1, atol=1e-3)
+    np.testing.assert_allclose(card.eta_upper, [-0.5, *[1.1] * 13], atol=1e-3)
 
 
 @pytest.mark.ray

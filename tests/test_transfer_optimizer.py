@@ -2,14 +2,17 @@
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import landscapes
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear_operator.utils.errors import NotPSDError
 
 from pup.errors import InputError
+from pup.transfer import surrogate
 from pup.transfer.optimizer import Search, choose, slices, suggest
 from pup.transfer.surrogate import Simulated
 from pup.transfer.trial import Purpose
@@ -136,6 +139,29 @@ def test_suggestions_stay_in_the_box_whatever_the_distances(distances, seed, siz
 def test_repeated_etas_and_equal_distances_do_no_harm():
     told = suggest(search(np.zeros((8, 3)), np.full(8, 0.4)), 9)
     assert np.isfinite(told.eta).all() and told.mean == pytest.approx(0.4, abs=0.05)
+
+
+def test_a_study_goes_on_where_the_fit_fails(monkeypatch):
+    """In all of BoTorch's attempts, each of which leaves hyperparameters somewhere."""
+    began = []
+
+    def lost(mll, **_):
+        began.append(float(mll.likelihood.noise.detach()))
+        mll.likelihood.noise = 0.7
+        raise NotPSDError
+
+    fit = partial(surrogate.fit_gpytorch_mll, optimizer=lost)
+    monkeypatch.setattr(surrogate, "fit_gpytorch_mll", fit)
+    eta = np.random.default_rng(0).uniform(-1, 1, (8, 3))
+    far = 1 - (eta**2).sum(axis=1)
+    told = surrogate.Surrogate(surrogate.Told((eta + 1) / 2, far)).hyperparameters
+    assert len(began) == 5 and began[0] == pytest.approx(0.05)
+    assert told["lengths"] == pytest.approx([1.0] * 3)
+    assert told["signal"] == pytest.approx(far.std())
+    assert told["noise"] == pytest.approx(far.std() * 0.05**0.5)
+    asked = suggest(search(eta, far), 9)
+    assert np.abs(asked.eta).max() <= 1
+    assert np.isclose(eta, choose(search(eta, far)).eta).all(axis=1).any()
 
 
 def test_it_finds_where_the_robot_walks_furthest():

@@ -66,7 +66,7 @@ def test_a_robot_of_another_size_sets_rate_sub_steps_and_costs(tmp_path: Path) -
     settings = TaskSettings.of(robot, Direction.BACKWARD)
     assert settings == replace(
         TaskSettings(direction=Direction.BACKWARD),
-        control_rate=(50.0, 50.0), substeps=6, torque_weight=1e-5, work_weight=2e-4,
+        control_rate=(50.0, 50.0), substeps=6, torque_weight=1e-5, work_weight=2e-4, smoothing=9,
     )  # fmt: skip
     task = walking(settings.without_noise(), robot=robot)
     task.reset()

@@ -38,7 +38,7 @@ class Learning:
         divergence between iterations, `constant` stays.
       divergence: that `adaptive` aims at, nats.
       gradient: largest norm of a step's gradient.
-      discount: of the future, gamma.
+      discount: of the future by a control step, gamma.
       decay: lambda of the advantages.
       weights: of the losses; that of the entropy falls to 0 over the training.
       sharpen: by which the logits grow in the course of the training, beside what is learnt: the

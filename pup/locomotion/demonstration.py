@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from pup.locomotion.evaluation import Walks, evaluate
 from pup.locomotion.pattern import TURN, Patterns, PatternSpace
+from pup.locomotion.start import torso_height
 from pup.locomotion.task import Observation, WalkingTask
 from pup.policy.imitation import Imitation
 from pup.policy.network import ProjectedPolicy, draw
+from pup.robot import RobotDescription
 from pup.sysid.fit import CmaFit, FitSettings
 
 Array = NDArray[np.float64]
 MakeTask = Callable[[int, int, float], WalkingTask]
 """Makes a task of so many simulations, from a seed, with a horizon in s."""
 
-SEARCH = 1
+SEARCH = 2
 """Raised with every change of what a search's losses depend on that `identity` does not tell."""
 
 POPULATION = 20
@@ -33,11 +35,14 @@ HORIZON = 7.0
 SIGMA = 0.06
 """First step of the search, on the unit cube."""
 FALL, STRAY = 1.0, 0.3
-"""What a walk that ends at once costs, m, and a metre aside.
+"""What a walk of the paper's robot costs that ends at once, m, and a metre aside any robot's.
 
 By the task's reward to stand for a second is worth as much as half a metre: a search for it learns
 to stand first, and sideways has come half as far after as many generations.
 """
+HEIGHT = 0.2787
+"""Of the torso of the paper's robot, m. A fall forward comes about as far: a tall robot's would pay
+more than standing, and a small one would not risk any for all the way that it can come."""
 FINALISTS = 10
 """Last generations whose best candidates walk again: one lucky walk is no gait."""
 JUDGES = 32
@@ -73,11 +78,15 @@ class PatternSearch:
       space: of the patterns.
       make: makes the tasks that candidates walk in.
       seed: of everything random.
+
+    Attributes:
+      fall: what a walk of this robot costs that ends at once, m.
     """
 
     def __init__(self, space: PatternSpace, make: MakeTask, seed: int) -> None:
         self.space, self.make, self.seed = space, make, seed
         start = np.full(space.dimension, 0.5)
+        self.fall = FALL * _size(space.robot)
         self._fit = CmaFit(FitSettings(start, SIGMA, POPULATION, seed=seed))
         self.losses: list[Array] = []
         self._best: list[Array] = []
@@ -85,7 +94,7 @@ class PatternSearch:
     @property
     def identity(self) -> str:
         """Of what the losses depend on beside the tasks: another search's are of no use."""
-        return f"{SEARCH} {self._fit.identity} {ROBOTS} {HORIZON} {FALL} {STRAY} {TURN}"
+        return f"{SEARCH} {self._fit.identity} {ROBOTS} {HORIZON} {self.fall} {STRAY} {TURN}"
 
     def resume(self, losses: Array) -> None:
         """Go on after generations whose losses are known, shape (n_generations, POPULATION)."""
@@ -96,7 +105,7 @@ class PatternSearch:
         """Walk a generation."""
         asked, index = self._fit.ask(), len(self.losses) + 1
         walks = self._walk(asked, ROBOTS, index)
-        losses = _losses(walks, ROBOTS)
+        losses = _losses(walks, ROBOTS, self.fall)
         self._tell(asked, losses)
         first = ROBOTS * int(losses.argmin())
         best = walks.of(slice(first, first + ROBOTS))
@@ -106,7 +115,7 @@ class PatternSearch:
         """Of the last generations' best patterns the one best on many robots, and its walks."""
         finalists = np.stack(self._best[-FINALISTS:])
         walks = self._walk(finalists, JUDGES, 0)
-        best = int(_losses(walks, JUDGES).argmin())
+        best = int(_losses(walks, JUDGES, self.fall).argmin())
         rows = slice(best * JUDGES, (best + 1) * JUDGES)
         return self.space.patterns(finalists[best : best + 1]), walks.of(rows)
 
@@ -122,17 +131,22 @@ class PatternSearch:
         return evaluate(lambda seen, _: taught(patterns, task, seen), task)
 
 
-def _losses(walks: Walks, robots: int) -> Array:
+def _size(robot: RobotDescription) -> float:
+    """Height of a robot's torso over that of the paper's, to two digits: more mean nothing."""
+    return float(f"{torso_height(robot) / HEIGHT:.2g}")
+
+
+def _losses(walks: Walks, robots: int, fall: float) -> Array:
     """What the search minimises, a value per pattern, m: the mean over its robots."""
     lost = 1 - walks.time / HORIZON
-    each = FALL * lost + STRAY * np.abs(walks.aside) - walks.distance
+    each = fall * lost + STRAY * np.abs(walks.aside) - walks.distance
     return np.asarray(each.reshape(-1, robots).mean(axis=1))
 
 
 def taught(patterns: Patterns, task: WalkingTask, seen: NDArray[np.float32]) -> Array:
     """What patterns do where a task is, shape (n, n_joints); `seen` is its proprioception."""
-    turned = seen[:, -4:-2] - seen[:, -2:]
-    return patterns.bins(task.phase(), turned.astype(np.float64), task.bins)
+    turned = (seen[:, -4:-2] - seen[:, -2:]).astype(np.float64) * task.settings.tempo
+    return patterns.bins(task.phase(), turned, task.bins)
 
 
 def imitate(

@@ -21,10 +21,14 @@ WAVES = 5
 TILTS = 2
 """The torso's roll and pitch."""
 TURN = 0.3
-"""Change of the torso's roll or pitch from one reading to the next that a gain of 1 answers with a
-whole reach, rad."""
+"""Change of the torso's roll or pitch, in a control step of the paper's robot, that a gain of 1
+answers with a whole reach, rad."""
 HALF_TURN = np.array([1.0, -1.0, -1.0, 1.0, 1.0])
 """What half a period later makes of the waves."""
+PHASES = np.arange(64) / 64
+"""Of the gait, at which it is held against its mirror image."""
+ROUNDING = 1e-9
+"""Difference of two mean squares that says nothing, rad²."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ class Patterns:
 
         Args:
           phase: its cosine and sine, shape (n, 2).
-          turned: change of the torso's roll and pitch between two readings, shape (n, TILTS), rad.
+          turned: change of the torso's roll and pitch in a control step of the paper's robot, shape
+            (n, TILTS), rad.
           bins: values that an action has.
         """
         c, s = phase[:, 0], phase[:, 1]
@@ -64,7 +69,8 @@ class PatternSpace:
 
     Joints that the reference gait moves take part. Where the robot has a mirror map one leg's
     reflex is the other's mirror image, and, if the direction has this symmetry too, so is its
-    pattern half a period later. A joint that is its own mirror image is free.
+    pattern: half a period later, or at once where the legs of the gait go in pairs, as in a bound
+    or a hop. A joint that is its own mirror image is free.
 
     Args:
       robot: with a gait.
@@ -73,7 +79,7 @@ class PatternSpace:
 
     def __init__(self, robot: RobotDescription, direction: Direction) -> None:
         assert robot.gait is not None
-        self.joints = len(robot.joints)
+        self.robot, self.joints = robot, len(robot.joints)
         moved = [i for i, s in enumerate(robot.gait.joints.values()) if s.a or s.b]
         partner, self._sign = _mirror(robot)
         self._partner = partner
@@ -81,6 +87,7 @@ class PatternSpace:
         self._felt = half
         self._waved = half if direction.symmetric else moved
         self._symmetric = direction.symmetric
+        self._later = _between_mirror_images(robot)
 
     @property
     def dimension(self) -> int:
@@ -95,7 +102,7 @@ class PatternSpace:
         waves[:, self._waved] = told[:, :cut].reshape(n, -1, WAVES)
         gains[:, self._felt] = told[:, cut:].reshape(n, -1, TILTS)
         if self._symmetric:
-            waves = self._completed(waves, self._waved, HALF_TURN)
+            waves = self._completed(waves, self._waved, self._later)
         # A mirrored robot rolls to the other side and pitches to the same.
         gains = self._completed(gains, self._felt, np.array([-1.0, 1.0]))
         return Patterns(waves, gains)
@@ -107,6 +114,18 @@ class PatternSpace:
         told = told.copy()
         told[:, other] = np.where(np.equal(other, given)[:, None], told[:, given], image)
         return told
+
+
+def _between_mirror_images(robot: RobotDescription) -> Array:
+    """What the time from the gait to its mirror image makes of the waves, shape (WAVES,).
+
+    Half a period or none, whichever the reference is nearer to.
+    """
+    assert robot.gait is not None
+    partner, sign = _mirror(robot)
+    image = sign * robot.gait.angles(PHASES)[:, partner]
+    half, none = (np.mean((robot.gait.angles(PHASES + later) - image) ** 2) for later in (0.5, 0.0))
+    return HALF_TURN if half <= none + ROUNDING else np.ones(WAVES)
 
 
 def _mirror(robot: RobotDescription) -> tuple[list[int], Array]:

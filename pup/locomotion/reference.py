@@ -1,9 +1,11 @@
 """The reference motion of an episode: from the start pose into the periodic gait."""
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
+from pup.physics.model import compile_model
 from pup.robot import Gait, RobotDescription
 
 Array = NDArray[np.float64]
@@ -61,5 +63,13 @@ def gait_of(robot: RobotDescription) -> Gait:
     if not robot.floating or not robot.feet:
         raise InputError(
             f"{file}: robot {robot.name!r} cannot walk: it needs a free joint in model.xml and feet"
+        )
+    model = compile_model(robot, "ground").compiled
+    kinds = {name: model.joint(name).type[0] for name in robot.joint_names}
+    slides = [name for name, kind in kinds.items() if kind == mujoco.mjtJoint.mjJNT_SLIDE]
+    if slides:
+        raise InputError(
+            f"{file}: robot {robot.name!r} cannot learn to walk: {', '.join(slides)} slide, and "
+            "the task's reach, noise and costs are of angles; leave [gait] out"
         )
     return robot.gait

@@ -54,6 +54,25 @@ class ParameterSampler:
         drawn = rng.uniform(-MARGIN, 1 + MARGIN, shape)
         return np.clip(drawn, self._lowest, self._highest)
 
+    def told(self, rng: np.random.Generator, count: int, noise: float) -> Array:
+        """Mu all over what policies are told in trainings, on the unit scale.
+
+        They are told mu with an error, within the widened bounds; of a parameter whose bounds are
+        one, so, nothing but the error.
+
+        Args:
+          rng: source of all that is random.
+          count: how many.
+          noise: the largest error.
+
+        Returns:
+          Shape (count, n_parameters).
+        """
+        free = self.bounds.upper > self.bounds.lower
+        lowest = np.where(free, -MARGIN, -min(noise, MARGIN))
+        highest = np.where(free, 1 + MARGIN, min(noise, 1 + MARGIN))
+        return rng.uniform(lowest, highest, (count, len(self.names)))
+
     def largest(self) -> Candidates:
         """All of the robot's parameters, in size no smaller than any drawn; one row."""
         if self.mu is not None:

@@ -4,7 +4,11 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from pup.policy.bundle import PolicyCard
 from pup.robot import RobotDescription, Walk
+
+RATE = math.fsum(Walk.control_rate) / 2
+"""Mean control rate of the paper's robot, Hz, at which everything was chosen that counts steps."""
 
 
 class Direction(StrEnum):
@@ -49,7 +53,7 @@ class TaskSettings:
         (authors). In an evaluation it goes on: the robot cannot see its heading, and to stray is
         no fall.
       bins: values that an action has per joint (paper, VI-A).
-      smoothing: actions in the moving average that moves the targets (authors).
+      smoothing: actions in the moving average that moves the targets (authors, at RATE).
       control_rate: range of the control rate, drawn per episode, Hz (paper, VI-B).
       position_noise: standard deviation of a joint's reading, rad (paper, VI-B).
       tilt_bias: largest error of the IMU's roll and pitch, drawn per episode, rad (paper, VI-B).
@@ -94,13 +98,30 @@ class TaskSettings:
     def of(cls, robot: RobotDescription, direction: Direction) -> "TaskSettings":
         """The task for a robot of its size."""
         walk = robot.walk
-        return cls(
+        settings = cls(
             direction=direction,
             control_rate=walk.control_rate,
             substeps=walk.substeps,
             torque_weight=walk.effort,
             work_weight=walk.work,
         )
+        return replace(settings, smoothing=max(1, round(cls.smoothing * settings.tempo)))
+
+    @classmethod
+    def of_policy(cls, robot: RobotDescription, card: PolicyCard) -> "TaskSettings":
+        """The task that a policy was trained for: it counts on the smoothing it had there."""
+        settings = cls.of(robot, Direction(card.direction))
+        return replace(settings, smoothing=card.smoothing)
+
+    @property
+    def rate(self) -> float:
+        """Mean control rate, Hz."""
+        return math.fsum(self.control_rate) / 2
+
+    @property
+    def tempo(self) -> float:
+        """Control steps in the time of one of the paper's robot."""
+        return self.rate / RATE
 
     def evaluation(self, rate: float | None = None) -> "TaskSettings":
         """The same task to its end or a fall, with the policy told the true parameters.
@@ -114,10 +135,9 @@ class TaskSettings:
 
     def without_noise(self) -> "TaskSettings":
         """The same task with exact readings, one start, and the mean control rate."""
-        rate = math.fsum(self.control_rate) / 2
         return replace(
             self,
-            control_rate=(rate, rate),
+            control_rate=(self.rate, self.rate),
             position_noise=0.0,
             tilt_bias=0.0,
             tilt_noise=0.0,

@@ -5,8 +5,9 @@ import mujoco.batch
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.locomotion.reference import Reference
 from pup.locomotion.settings import TaskSettings
-from pup.physics.model import compile_model, lowest_point, standing_qpos
+from pup.physics.model import Model, compile_model, lowest_point, standing_qpos
 from pup.physics.rotations import multiply, rotation
 from pup.robot import RobotDescription
 
@@ -29,13 +30,9 @@ class Starts:
     def __init__(
         self, robot: RobotDescription, pose: Array, settings: TaskSettings, most: int
     ) -> None:
-        assert robot.gait is not None
         self.settings = settings
         self.model = compile_model(robot, "ground")
-        torso = np.full(4, np.nan)
-        if robot.gait.start_pitch is not None:
-            torso = rotation(np.array([0.0, robot.gait.start_pitch, 0.0]))
-        self.qpos = standing_qpos(robot, self.model, pose, torso)
+        self.qpos = _start(robot, self.model, pose)
         self._batch = mujoco.batch.Batch(self.model.compiled, most, 1)
         self._places, self._axes = self._batch.bind("geom_xpos"), self._batch.bind("geom_xmat")
 
@@ -60,3 +57,26 @@ class Starts:
         self._batch.qpos[ids] = qpos
         self._batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_POS)
         return lowest_point(self.model.compiled, self._places[ids], self._axes[ids])
+
+
+def torso_height(robot: RobotDescription) -> float:
+    """How high the torso's centre of mass is where episodes start, m, on a floor at height 0.
+
+    Args:
+      robot: has a free torso and a gait.
+    """
+    assert robot.gait is not None and robot.torso is not None
+    model = compile_model(robot, "ground")
+    data = mujoco.MjData(model.compiled)
+    data.qpos[:] = _start(robot, model, Reference(robot.gait).start)
+    mujoco.mj_kinematics(model.compiled, data)
+    return float(data.body(robot.torso).xipos[2])
+
+
+def _start(robot: RobotDescription, model: Model, pose: Array) -> Array:
+    """The configuration that episodes start in, without what is drawn, shape (nq,)."""
+    assert robot.gait is not None
+    torso = np.full(4, np.nan)
+    if robot.gait.start_pitch is not None:
+        torso = rotation(np.array([0.0, robot.gait.start_pitch, 0.0]))
+    return standing_qpos(robot, model, pose, torso)

@@ -120,6 +120,7 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
         _contacts(robot, compiled),
     )
     if floating:
+        _check_first(robot, compiled)
         _check_floor(robot, compiled)
         _check_mount(robot, model)
     return model
@@ -145,6 +146,15 @@ def _check_limits(robot: RobotDescription, model: mujoco.MjModel) -> None:
         raise InputError(
             f"{told}is far beyond its range [{low:.3g}, {high:.3g}] rad in model.xml; is one of "
             'them in degrees? model.xml is, unless it has <compiler angle="radian"/>'
+        )
+
+
+def _check_first(robot: RobotDescription, model: mujoco.MjModel) -> None:
+    """Refuse a torso that is not at the head of qpos and qvel, where everybody looks for it."""
+    if model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise InputError(
+            f"{robot.model_path}: joint {model.joint(0).name!r} stands before the free joint; list "
+            f"the robot's torso {robot.torso!r} first in worldbody"
         )
 
 

@@ -29,6 +29,8 @@ CARD, WEIGHTS, GRAPH = "policy.json", "weights.npz", "policy.onnx"
 WEIGHTS_LIMIT = 64 * 2**20  # bytes
 CLIP, FLOOR = 5.0, 1e-6
 """As in `pup.policy.network`, whose import would be torch's."""
+NAMED = 3
+"""Differences of a robot from the one of the training that a refusal names."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,22 @@ def read_bundle(folder: Path, robot: RobotDescription | None = None) -> tuple[Po
         return card, {name: packed[name] for name in packed.files}
 
 
+def _differences(card: PolicyCard, robot: RobotDescription) -> list[str]:
+    """What a policy's targets and readings rely on and this robot has otherwise than in training.
+
+    All else may differ: a diagnosis corrects parameters and terms.
+    """
+    limits = zip(robot.joints, card.lower, card.upper, strict=True)
+    return [
+        *(f"limits of {j.name}" for j, *trained in limits if [j.lower, j.upper] != trained),
+        *(
+            f"gait.{f.name}"
+            for f in fields(Gait)
+            if getattr(card.gait, f.name) != getattr(robot.gait, f.name, None)
+        ),
+    ]
+
+
 def _content(file: Path, digest: str) -> bytes:
     try:
         if file.stat().st_size > WEIGHTS_LIMIT:
@@ -205,8 +223,24 @@ class NumpyPolicy:
 
     @classmethod
     def load(cls, folder: Path, robot: RobotDescription | None = None) -> "NumpyPolicy":
-        """Read a bundle; see `read_bundle`."""
-        return cls(*read_bundle(folder, robot))
+        """Read a bundle to run it; whoever trains it further calls `read_bundle`.
+
+        Args:
+          folder: of the bundle.
+          robot: the robot it shall run.
+
+        Raises:
+          InputError: as `read_bundle`, or the robot's joint limits or gait are not those that it
+            was trained with.
+        """
+        card, weights = read_bundle(folder, robot)
+        if robot is not None and (other := _differences(card, robot)):
+            named = ", ".join(other[:NAMED]) + (" and more" if other[NAMED:] else "")
+            raise InputError(
+                f"{folder / CARD}: trained on a description of {robot.name!r} with other {named}; "
+                "use that description, or train it further on this one (`pup train --start`)"
+            )
+        return cls(card, weights)
 
     def project(self, parameters: Array) -> Array:
         """Eta of mu.

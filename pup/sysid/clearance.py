@@ -50,15 +50,14 @@ class Clearance:
         count = 1 + int(np.ceil(np.abs(end - start).max() / STRIDE))
         return all(self.free(start + s * (end - start)) for s in np.linspace(0, 1, count + 1))
 
-    def way(self, start: Array, end: Array) -> tuple[Array, ...]:
-        """Poses on the way to the end, which is the last of them.
+    def way(self, start: Array, end: Array) -> tuple[Array, ...] | None:
+        """Poses on the way to the end, which is the last of them; None where no way is free.
 
-        Straight where nothing touches, else by zero or a named pose of the robot; straight all the
-        same where that does not help.
+        Straight where nothing touches, else by zero or a named pose of the robot.
         """
         if self.path_free(start, end):
             return (end,)
         for between in self._named:
             if self.path_free(start, between) and self.path_free(between, end):
                 return between, end
-        return (end,)
+        return None

@@ -11,6 +11,7 @@ from pup.physics.rest import ticks_at_rest
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.recording import Recording
 from pup.robot import RobotDescription
+from pup.sysid.excitation import joint_units
 
 Array = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ STANDING = frozenset(("stand", "standup"))
 FALLING = frozenset(("fall",))
 
 LOST_POSITION = np.pi
-"""Error counted per joint or angle of a simulation that broke down, rad."""
+"""Error counted per joint or angle of a simulation that broke down, rad; of a slide its range."""
 LOST_FOOT = 1.0
 """The same along each axis of a foot, m, from tick to tick."""
 
@@ -31,8 +32,8 @@ class Terms:
     """The three sums over time, per candidate and recording.
 
     Attributes:
-      position: sum over ticks of the norm of the joint position error, shape (n_candidates,
-        n_recordings).
+      position: sum over ticks of the norm of the joint position error in the joints' units, shape
+        (n_candidates, n_recordings).
       tilt: the same of the torso's roll and pitch; 0 where a recording has none.
       feet: the length of the path of the feet; 0 unless standing, m.
     """
@@ -52,12 +53,14 @@ class ReplayLoss:
     """Compares trajectories with the recordings they replay.
 
     Args:
-      robot: gives the order of the joints.
+      robot: gives the order of the joints, and what stands for a radian in each (`joint_units`):
+        a norm of radians and metres would say next to nothing of what slides.
       recordings: the measurements, in the order of the trajectories.
     """
 
     def __init__(self, robot: RobotDescription, recordings: Sequence[Recording]) -> None:
         self.recordings = tuple(recordings)
+        self.units, self.feet = joint_units(robot), len(robot.feet)
         self.ticks = tick_slices(recordings)
         self.position = np.concatenate(
             [r.position[:, [r.joints.index(n) for n in robot.joint_names]] for r in recordings]
@@ -74,10 +77,16 @@ class ReplayLoss:
             _rest(r, part.start) for r, part in zip(recordings, self.ticks, strict=True)
         )
 
+    @property
+    def numbers(self) -> int:
+        """Errors of a tick that equation 1 weighs."""
+        tilt, feet = bool(self.tilting.any()), bool(self.standing.any())
+        return len(self.units) + 2 * tilt + 3 * self.feet * feet
+
     def terms(self, trajectories: Trajectories) -> Terms:
         """The three sums, per candidate and recording."""
         return Terms(
-            self._sum(_length(_difference(trajectories.position, self.position, LOST_POSITION))),
+            self._sum(_length(self._joint_error(trajectories) / self.units)),
             self._sum(_length(self._tilt_error(trajectories))) * self.tilting,
             self._sum(_length(self._feet_error(trajectories))) * self.standing,
         )
@@ -145,23 +154,28 @@ class ReplayLoss:
         return lines
 
     def rmse(self, trajectories: Trajectories) -> Array:
-        """Root mean square joint error per candidate, recording and joint, rad.
+        """Root mean square joint error per candidate, recording and joint, rad (m for a slide).
 
         Shape (n_candidates, n_recordings, n_joints); NaN for a joint that was never read.
         """
-        error = _difference(trajectories.position, self.position, LOST_POSITION)
+        error = self._joint_error(trajectories)
         square = [np.nanmean(error[:, part] ** 2, axis=1) for part in self.ticks]
         return np.asarray(np.sqrt(np.stack(square, axis=1)))
 
     def errors(self, trajectories: Trajectories) -> tuple[Array, Array]:
         """Joint errors (n, n_ticks, n_joints) and tilt errors (n, n_ticks, 2), rad.
 
-        Zero where nothing was measured.
+        Those of a slide are in its unit. Zero where nothing was measured.
         """
-        position = _difference(trajectories.position, self.position, LOST_POSITION)
+        position = self._joint_error(trajectories) / self.units
         tilt = self._tilt_error(trajectories)
         counts = self._per_tick(self.tilting)
         return np.nan_to_num(position), np.where(counts[:, None], np.nan_to_num(tilt), 0.0)
+
+    def _joint_error(self, trajectories: Trajectories) -> Array:
+        """Errors of the joints, (n, n_ticks, n_joints), rad (m for a slide); NaN: not measured."""
+        lost = LOST_POSITION * self.units
+        return _difference(trajectories.position, self.position, lost)
 
     def _tilt_error(self, trajectories: Trajectories) -> Array:
         """Errors of roll and pitch, the short way round the circle; from the rest on, if there is.
@@ -211,7 +225,7 @@ def _flat(values: Array) -> Array:
     return values.reshape(*values.shape[:2], -1)
 
 
-def _difference(simulated: Array, measured: Array, lost: float) -> Array:
+def _difference(simulated: Array, measured: Array, lost: Array | float) -> Array:
     """Error where measured, `lost` where the simulation broke down, NaN where not measured."""
     error = simulated - measured
     return np.where(np.isnan(error) & ~np.isnan(measured), lost, error)

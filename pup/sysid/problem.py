@@ -1,6 +1,7 @@
 """What a fit evaluates: recordings, a torque law, and the parameters that are free."""
 
 import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,6 +10,7 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.errors import InputError
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import ParameterSpace
 from pup.physics.simulator import Trajectories
@@ -18,12 +20,14 @@ from pup.sysid.loss import ReplayLoss, Terms
 
 Array = NDArray[np.float64]
 
-MODEL = 9
+MODEL = 10
 """Raised with every change of the physics or the loss, which makes old checkpoints another's."""
 MEMORY = 256 * 2**20
 """Bytes that trajectories and what equation 1 makes of them may take at once, about."""
 COPIES = 3.5
 """Arrays as large as the trajectories that equation 1 holds beside one another, with them."""
+SLOPES = 3
+"""Arrays as large as the Jacobian that are needed beside one another to take it."""
 _VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "numba", "nevergrad", "cma")))
 
 
@@ -92,8 +96,11 @@ class Problem:
 
     def terms(self, unit: Array) -> Terms:
         """The sums of equation 1 of candidates (n, n_free), however many: some are in memory."""
-        pieces = np.array_split(unit, -(-len(unit) // self.at_once))
-        return Terms.joined([self.loss.terms(self.replay(piece)) for piece in pieces])
+        return Terms.joined([self.loss.terms(self.replay(piece)) for piece in self._pieces(unit)])
+
+    def _pieces(self, unit: Array) -> list[Array]:
+        """Candidates in parts whose trajectories fit in MEMORY."""
+        return np.array_split(unit, -(-len(unit) // self.at_once))
 
     @cached_property
     def at_once(self) -> int:
@@ -107,5 +114,29 @@ class Problem:
         return self.loss.total(self.terms(unit))
 
     def errors(self, unit: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Weighted errors of candidates (n, n_free) and their blocks, see ReplayLoss."""
-        return self.loss.weighted_errors(self.replay(unit))
+        """Weighted errors of candidates (n, n_free) and their blocks, see ReplayLoss.
+
+        They are as long as the recordings, however few of them are replayed at once: see `check`.
+        """
+        parts = [self.loss.weighted_errors(self.replay(piece)) for piece in self._pieces(unit)]
+        return np.concatenate([errors for errors, _ in parts]), parts[0][1]
+
+    def check(self) -> None:
+        """Refuse recordings whose slopes, by all free parameters, this computer could not hold.
+
+        Raises:
+          InputError: they are that long.
+        """
+        samples, free = self.loss.ticks[-1].stop, len(self.free)
+        needed, there = SLOPES * 8 * self.loss.numbers * samples * free, _memory()
+        if needed > there:
+            raise InputError(
+                f"{samples} samples of {self.loss.numbers} errors, by {free} parameters, take "
+                f"{needed / 2**30:.1f} GiB; this computer has {there / 2**30:.1f}: give fewer or "
+                "shorter recordings"
+            )
+
+
+def _memory() -> int:
+    """Of this computer, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

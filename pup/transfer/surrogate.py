@@ -9,12 +9,14 @@ which of them the robot resembles.
 
 import hashlib
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
+from botorch.exceptions.errors import ModelFittingError
 from botorch.exceptions.warnings import BotorchWarning
 from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
@@ -295,8 +297,8 @@ def _model(told: Told, prior: Landscapes | None, centre: float, scale: float) ->
 
 
 def _fit(model: SingleTaskGP) -> None:
-    """Find the most likely hyperparameters; those of the priors stay where it fails."""
-    with warnings.catch_warnings():
+    """Find the most likely hyperparameters; those that it began with stay where it fails."""
+    with warnings.catch_warnings(), suppress(ModelFittingError):  # BoTorch has put them back then
         warnings.simplefilter("ignore", BotorchWarning)
         warnings.simplefilter("ignore", RuntimeWarning)
         fit_gpytorch_mll(

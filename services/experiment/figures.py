@@ -156,7 +156,7 @@ def searches(part: Mapping[str, Any]) -> Drawing:
     far = walking(part["walks"])
     for arm, told in part["searches"].items():
         shares = [
-            np.array(best_so_far(distances)) / far[robot]
+            np.nan_to_num(best_so_far(distances), neginf=0.0) / far[robot]  # no walk is no distance
             for robot, distances in told.items()
             if distances and robot in far
         ]

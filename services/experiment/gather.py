@@ -7,6 +7,7 @@ from typing import Any
 from pup.files import read_json, sha256
 from pup.policy.bundle import CARD
 from pup.policy.shape import Method
+from pup.transfer.trial import TOLD, TrialState
 from services.experiment.cells import DIAGNOSED, DIAGNOSED_FLEET, FLEET, UNDIAGNOSED, Cell
 from services.experiment.diagnosed import diagnoses
 from services.experiment.plan import Plan, Walk, meant
@@ -145,14 +146,15 @@ def _direction(
             fitted = result["fitted"]
             if fitted and fitted["distance"] and not name.endswith(PRIOR):
                 walks.setdefault(f"{arm}{FITTED}", {})[robot] = fitted
-            searched = [
-                one["distance"]
-                for one in result["walks"]
-                if one["purpose"] in ("initial", "search") and one["state"] == "succeeded"
-            ]
             if fitted is not None:
-                searches.setdefault(arm, {})[robot] = searched
+                searches.setdefault(arm, {})[robot] = _searched(result["walks"])
     return {"walks": walks, "searches": searches, "planned": planned}
+
+
+def _searched(walks: list[dict[str, Any]]) -> list[float | None]:
+    """Distances of a search's trials, m, in order; None where eta was infeasible."""
+    searched = (w for w in walks if w["purpose"] in ("initial", "search") and w["state"] in TOLD)
+    return [w["distance"] if w["state"] == TrialState.SUCCEEDED else None for w in searched]
 
 
 def _bounds(

@@ -147,7 +147,8 @@ class Player:
           repeat_of: id of the first recording of this script, where this is another.
 
         Raises:
-          InputError: a rule of safety stopped the robot.
+          InputError: a rule of safety stopped the robot, or it would touch itself on its way to the
+            first pose.
           BusError: it does not answer.
         """
         self.body.limp()
@@ -159,7 +160,11 @@ class Player:
         self._stay(pose, STEADY, name)
         if hold == "hand":  # which would else hold on to one that moves
             self._say(cmd="release")
-        for goal in self._clearance.way(pose, motion.target[0]):
+        way = self._clearance.way(pose, motion.target[0])
+        if way is None:  # all robots play the same scripts: this one is not drawn anew
+            self.body.limp()
+            raise InputError(f"recording {name}: no way to its first pose without touching itself")
+        for goal in way:
             for share in np.arange(PERIOD, WAY + 1e-9, PERIOD) / WAY:
                 self._tick(pose + share * (goal - pose), PERIOD, name)
             pose = goal

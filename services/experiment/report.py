@@ -96,7 +96,8 @@ def _acceptance(told: Mapping[str, Any]) -> Iterator[Html]:
         "p",
         "A line holds where the whole interval is above its bar; it is not shown where the number "
         "is and the interval is not, and fails where the number is below. It is incomplete where "
-        "robots are missing that were planned.",
+        "robots are missing that were planned. Each method is one training: intervals are over "
+        "robots, and do not hold the luck of its seed.",
     )
 
 

@@ -104,9 +104,14 @@ def ratio(pairs: Sequence[Sequence[float]]) -> Estimate:
     return Estimate(value, -np.inf, np.inf, n)
 
 
-def best_so_far(distances: Sequence[float]) -> list[float]:
-    """The largest of the walks up to each, m."""
-    return [float(d) for d in np.maximum.accumulate(np.array(distances, dtype=np.float64))]
+def best_so_far(distances: Sequence[float | None]) -> list[float]:
+    """The largest of the walks up to each trial, m; -inf before the first.
+
+    Args:
+      distances: of the trials, m; None where eta was infeasible.
+    """
+    walked = np.array([-np.inf if d is None else d for d in distances])
+    return [float(d) for d in np.maximum.accumulate(walked)]
 
 
 def needed(distances: Sequence[float], goal: float) -> int | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pup.errors import InputError
 from pup.files import sha256
-from pup.policy.bundle import WEIGHTS, NumpyPolicy, read_bundle
+from pup.policy.bundle import WEIGHTS, NumpyPolicy
 from pup.policy.shape import Method
 from pup.recording import Recording, load_recordings
 from pup.recording_cuts import cut
@@ -148,7 +148,7 @@ def policy(task: Task) -> dict[str, Any]:
     method, direction = Method(told["method"]), Direction(told["direction"])
     if "ready" in told:
         given = Path(task.cell.given["policy"])
-        card, _ = read_bundle(given, task.robot)
+        card = NumpyPolicy.load(given, task.robot).card
         if (card.method, card.direction) != (method, direction):
             raise InputError(
                 f"{given}: is {card.direction}, {card.method}; it lies where {direction}, "
@@ -185,14 +185,14 @@ def _one_core() -> Iterator[int]:
 
 def landscape(task: Task) -> dict[str, Any]:
     """How far a policy walks in simulation over eta, for trials to begin with."""
-    from pup.locomotion.settings import Direction, TaskSettings
+    from pup.locomotion.settings import TaskSettings
     from pup.sysid.result import read_bounds
     from services.walk import write_landscape
 
     robot, told, file = task.robot, task.told, task.out / "simulated.json"
     walker = NumpyPolicy.load(task.needed["policy"] / "policy", robot)
     bounds = read_bounds(task.needed["bounds"] / "bounds.json", robot)
-    settings = TaskSettings.of(robot, Direction(walker.card.direction)).evaluation(told["rate"])
+    settings = TaskSettings.of_policy(robot, walker.card).evaluation(told["rate"])
     settings = replace(settings, horizon=told["horizon"])
     write_landscape(file, robot, walker, bounds, settings, told["etas"], told["seed"], 1)
     return {"simulated": sha256(file)}
