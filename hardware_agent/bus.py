@@ -349,7 +349,6 @@ class Bus:
                 f"{self.settings.port}: servo {name} is of model {model}, not an MX-28 with "
                 f"Protocol {own.protocol}.0 (model {own.model}); see [bus] protocol"
             )
-        self._reach[name] = self._own_limits(name)
         for told, span, wanted in (
             ("return delay", own.return_delay, 0),
             ("status return level", own.status_level, 2),
@@ -360,14 +359,13 @@ class Bus:
                 if self._register(name, span) != wanted:
                     raise BusError(f"{self.settings.port}: servo {name} keeps {told} {known}")
                 yield f"servo {name}: {told} {known} made {wanted}"
+        self._reach[name] = self._own_limits(name)
 
     def _own_limits(self, name: int) -> tuple[float, float]:
         """Between which angles a servo takes goals, rad; beyond them it stays where it is."""
         own, where = self.registers, f"{self.settings.port}: servo {name}"
-        mode = POSITION if own.mode is None else self._register(name, own.mode)
-        least, largest = (self._register(name, span) for span in own.limits)
-        if mode is None or least is None or largest is None:
-            raise BusError(f"{where} does not tell its mode and limits")
+        mode = POSITION if own.mode is None else self._sure(name, own.mode)
+        least, largest = (self._sure(name, span) for span in own.limits)
         if mode != POSITION:
             raise InputError(
                 f"{where} is in operating mode {mode} and takes no angles; set mode {POSITION}, "
@@ -379,6 +377,15 @@ class Bus:
                 "joint mode, such as limits 0 and 4095, with ROBOTIS' tools"
             )
         return self._mountings[name].span(least, largest)
+
+    def _sure(self, name: int, span: Span) -> int:
+        """A register as it is told twice alike: an answer may be a late one to another question."""
+        told = None
+        for _ in range(1 + self.settings.tries):
+            before, told = told, self._register(name, span)
+            if told is not None and told == before:
+                return told
+        raise BusError(f"{self.settings.port}: servo {name} does not tell its mode and limits")
 
     def _register(self, name: int, span: Span) -> int | None:
         """A register of one servo; None when it does not answer, however often it is asked."""

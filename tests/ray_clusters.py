@@ -19,6 +19,8 @@ from workers.cluster import RAY_SETTINGS
 
 MARK = "PUP_TEST_NODE"
 """Environment variable that every process of a node has, those of its jobs too."""
+STARTED = "Ray runtime started"
+"""What a node's log says once it has joined."""
 
 
 def commands(words: str) -> list[int]:
@@ -56,22 +58,21 @@ class RayCluster:
     def start_head(self) -> None:
         more = (f"--port={self.gcs}", f"--dashboard-port={self.dashboard}", "--num-cpus=0")
         place = ("--node-ip-address=127.0.0.1", "--include-dashboard=true")
-        self._start("head", 1, "--head", *place, *more)
+        self._start("head", "--head", *place, *more)
 
     def start_worker(self, number: int, cpus: int = 1, ip: str = "127.0.0.1") -> None:
-        there, address = self._alive(), f"--address=127.0.0.1:{self.gcs}"
         more = (f"--num-cpus={cpus}", f"--node-ip-address={ip}")
-        self._start(f"worker{number}", there + 1, address, *more)
+        self._start(f"worker{number}", f"--address=127.0.0.1:{self.gcs}", *more)
 
-    def _alive(self) -> int:
-        """Nodes that the cluster believes in."""
+    def _answers(self) -> bool:
+        """Whether the head's dashboard, which takes jobs, knows of a node."""
         headers = {"Authorization": f"Bearer {self.token}"}
         try:
             answer = httpx.get(f"{self.url}/nodes?view=summary", headers=headers, timeout=20)
             nodes = answer.json()["data"]["summary"]
         except (httpx.HTTPError, ValueError, KeyError):
-            return 0
-        return sum(node["raylet"].get("state") == "ALIVE" for node in nodes)
+            return False
+        return any(node["raylet"].get("state") == "ALIVE" for node in nodes)
 
     def processes(self, node: str) -> list[int]:
         """Processes of a node, and of the jobs on it."""
@@ -89,12 +90,15 @@ class RayCluster:
     def _mark(self, node: str) -> str:
         return f"{MARK}={self.name}-{node}"
 
-    def _start(self, node: str, alive: int, *arguments: str) -> None:
+    def _start(self, node: str, *arguments: str) -> None:
         """Start a node; on a busy machine Ray gives up after a minute, so more than once."""
+        log = self._log(node)
         for _ in range(4):
+            before = len(log.read_text()) if log.exists() else 0
             process = self._process(node, arguments)
             while process.poll() is None:
-                if self._alive() >= alive:
+                # Not by how many there are: the cluster believes in one that was killed for a while.
+                if STARTED in log.read_text()[before:] and self._answers():
                     return
                 time.sleep(0.3)
             self.kill(node)
