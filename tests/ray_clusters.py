@@ -97,7 +97,7 @@ class RayCluster:
             before = len(log.read_text()) if log.exists() else 0
             process = self._process(node, arguments)
             while process.poll() is None:
-                # Not by how many there are: the cluster believes in one that was killed for a while.
+                # Not by how many there are: one that was killed counts for a while.
                 if STARTED in log.read_text()[before:] and self._answers():
                     return
                 time.sleep(0.3)

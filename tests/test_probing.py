@@ -33,7 +33,7 @@ def test_a_change_is_told_of_all_joints_that_feel_it(
 ) -> None:
     simulated = replays([here, *({**here, **probe} for probe in DAMPED)])
     before = replays.simulated
-    ((base, changed),) = probed([(here, DAMPED)], replays)
+    ((base, changed),) = probed([(here, DAMPED, DAMPED)], replays)
     assert replays.simulated - before == (3 if here else 2)
     assert base == pytest.approx(simulated[0], abs=1e-6)
     assert changed == pytest.approx(simulated[1:] - simulated[0], abs=1e-6)
