@@ -8,7 +8,6 @@ its way through contact, not whether real floors are named. That blind sets tell
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pup.diagnosis.engine import Diagnosis, diagnose
-from pup.diagnosis.replays import Batch, Bench
-from pup.diagnosis.residuals import Measured
+from pup.diagnosis.replays import Bench, threads
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec
@@ -30,8 +28,6 @@ LONGEST, LEAD = 7.0, 0.5
 """Of a motion, and before it begins to walk, s."""
 TONES, AMPLITUDE = (0.4, 0.9, 1.6), 0.05
 """Of the sway, Hz and rad."""
-
-Runner = Callable[[Sequence[Batch]], list[np.ndarray]]
 
 
 def concealed(robot: RobotDescription) -> dict[str, TermSpec | None]:
@@ -51,12 +47,12 @@ def concealed(robot: RobotDescription) -> dict[str, TermSpec | None]:
 def motions(robot: RobotDescription) -> list[Motion]:
     """Two in the air, and on the ground standing up, walking on the spot and swaying."""
     told = script(robot, ("step:0.3", "chirp", "standup:2"), np.random.default_rng(1))
-    short = [replace(m, time=m.time[k], target=m.target[k]) for m in told for k in [_kept(m)]]
-    return [*short, _walk(robot), _sway(robot)]
+    return [*map(_beginning, told), _walk(robot), _sway(robot)]
 
 
-def _kept(motion: Motion) -> np.ndarray:
-    return np.asarray(motion.time <= LONGEST)
+def _beginning(motion: Motion) -> Motion:
+    kept = motion.time <= LONGEST
+    return replace(motion, time=motion.time[kept], target=motion.target[kept])
 
 
 def _walk(robot: RobotDescription) -> Motion:
@@ -89,12 +85,6 @@ def recorded(robot: RobotDescription, hidden: TermSpec | None, seed: int) -> tup
     return record_virtual(other, motions(robot), "pd", true, rng, SensorNoise(), repeats=1)
 
 
-def runner(measured: Measured) -> Runner:
-    """Replays in this process."""
-    bench = Bench(measured)
-    return lambda batches: [bench.run(batch) for batch in batches]
-
-
 def told(diagnosis: Diagnosis) -> str:
     """Verdict, findings and what they gain, in a line."""
     findings = [
@@ -117,7 +107,9 @@ def main() -> None:
         runs = recorded(robot, known[name], 100 + list(known).index(name))
         begun = time.process_time()
         with threadpool_limits(limits=1):
-            diagnosis = diagnose(robot, runs, runner, 1, lambda stage, share: None)
+            diagnosis = diagnose(
+                robot, runs, lambda m: threads(Bench(m), 1), 1, lambda stage, share: None
+            )
         seconds = time.process_time() - begun
         print(
             f"{name}: {told(diagnosis)}; {diagnosis.replays} candidates, {seconds:.0f} s",

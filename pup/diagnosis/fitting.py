@@ -18,6 +18,7 @@ from pup.diagnosis.residuals import LOST, Noise
 from pup.sysid.gauss_newton import updated
 
 Array = NDArray[np.float64]
+Rows = list[dict[str, float]]
 
 STEP = 0.0004
 """Finite-difference step, of a coordinate."""
@@ -203,9 +204,6 @@ def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
         fit.age = 0
 
 
-Rows = list[dict[str, float]]
-
-
 def _differences(fit: Fit, at: Array) -> tuple[Array, tuple[Rows, Rows]]:
     """Steps of the coordinates around a point, and the column that each sets.
 
@@ -274,7 +272,7 @@ def _chi2(fit: Fit, residual: Array, at: Array) -> float:
     return float(weighted @ weighted) + (fit.belief.cost(at) if fit.belief else 0.0)
 
 
-def difference(fit: Fit, i: int, at: Array, width: float = 1.0) -> float:
+def difference(fit: Fit, i: int, at: Array, width: float) -> float:
     """A step of a coordinate into its range, for a slope; so many times as wide as usual."""
     coordinate = fit.coordinates[i]
     step = width * (STEP if coordinate.scale is None else 5 * STEP)
