@@ -2,16 +2,27 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from pup.diagnosis import fitting
 from pup.diagnosis.beginnings import nearer
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import STEP, Fit, differentiate, fit_together
+from pup.diagnosis.fitting import (
+    ON_GROUND,
+    STEP,
+    Fit,
+    difference,
+    differentiate,
+    fit_together,
+)
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
 from pup.physics.parameters import robot_space
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
 
 OP2 = RobotDescription.load("darwin_op2")
 AWAY = 0.4
@@ -52,6 +63,39 @@ def test_what_hangs_and_what_is_noise_alone_stays(name: str, away: float) -> Non
     at, simulated = fit.at.copy(), replays.simulated
     nearer([fit], replays, assumed_noise(replays.measured))
     assert np.array_equal(fit.at, at) and replays.simulated == simulated
+
+
+def test_a_fit_in_contact_ends_on_narrow_slopes_and_forgets_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Wide ones lead over jumps, and tell what a fit can imitate; only narrow ones end it."""
+    asked: list[float] = []
+
+    def told(fit: Fit, i: int, at: Array, width: float) -> float:
+        asked.append(width)
+        return difference(fit, i, at, width)
+
+    monkeypatch.setattr(fitting, "difference", told)
+    replays = made("standup_2")
+    noise = assumed_noise(replays.measured)
+    fit, there = fit_of_itself(replays, 0.1)
+    fit_together([fit], replays, noise)
+    in_contact = asked[1::2]  # each time in the air first
+    assert in_contact[0] == ON_GROUND and in_contact[-1] == 1.0
+    assert in_contact == sorted(in_contact, reverse=True)
+    assert fit.done and fit.at[0] == pytest.approx(there, abs=0.005)
+    assert fit.jacobian is None
+    asked.clear()
+    differentiate([fit], replays, noise)
+    assert asked[1::2] == [ON_GROUND]
+
+
+def test_a_rough_fit_in_contact_keeps_to_wide_slopes() -> None:
+    replays = made("standup_2")
+    fit, _ = fit_of_itself(replays, 0.1)
+    fit.thorough = False
+    fit_together([fit], replays, assumed_noise(replays.measured))
+    assert fit.done and fit.jacobian is not None
 
 
 def test_slopes_in_contact_are_told_across_two_percent() -> None:

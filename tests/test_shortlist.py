@@ -51,3 +51,15 @@ def test_the_class_of_the_best_is_looked_at_where_that_acts() -> None:
     assert chosen(score("torque_speed_limit", ANKLE, 90.0), rival)[1:] == [
         rival.trace.hypothesis.key
     ]
+
+
+def test_effects_of_contact_are_looked_at_whatever_they_promise() -> None:
+    """A nominal fit that lacks a soft floor ends where the floor's slope says nothing of it."""
+    first = score("backlash", KNEE, 5000.0)
+    soft = score("ground_compliance", Place("ground"), 1.0)
+    slippery = score("ground_friction", Place("foot", "l_foot"), 0.5)
+    late = score("imu_delay", Place("sensor"), 0.5)
+    ranking, effects = (first, soft, slippery, late), [soft, slippery, late]
+    assert chosen(*ranking) == [first.trace.hypothesis.key]
+    told = [s.trace.hypothesis.key for s in shortlist(ranking, 15.0, contact=True)]
+    assert told[1:] == [s.trace.hypothesis.key for s in effects]

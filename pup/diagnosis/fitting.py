@@ -22,9 +22,10 @@ Rows = list[dict[str, float]]
 
 STEP = 0.0004
 """Finite-difference step, of a coordinate."""
-ON_GROUND, WIDEST = 50.0, 100.0
-"""The same in contact, and at most, in that step: impacts make trajectories jump by a hair of time,
-and a slope told across less than 2 % is of jumps alone."""
+ON_GROUND, NARROWER = 50.0, 7.1
+"""The same in contact, in that step, and how many times narrower it then gets: impacts make
+trajectories jump by a hair of time. Slopes across 2 % lead over the jumps, and narrow ones to the
+bottom of the hollow that they lead to."""
 DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
 """Tried at once, relative to the current one: at first, and where that led nowhere."""
 ENOUGH = 0.2
@@ -57,6 +58,7 @@ class Fit:
       damping: of Levenberg and Marquardt.
       age: steps since the Jacobian was fresh.
       width: of its finite differences, in their usual one.
+      contact: the same of recordings in contact, in that one.
       slack: relative gain of chi-squared below which it has ended.
       stuck: times in a row that no trial was better.
       moved: whether any was so far.
@@ -78,6 +80,7 @@ class Fit:
     stuck: int = 0
     moved: bool = False
     width: float = 1.0
+    contact: float = ON_GROUND
     slack: float = 1e-5
 
     @property
@@ -145,14 +148,17 @@ def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations
         _look_around([fit for fit in fits if not fit.done], replays, noise)
         moving = [fit for fit in fits if not fit.done]
         if not moving:
-            return
+            break
         trials = [(fit, at) for fit in moving for at in _trials(fit)]
         reached = _reached(trials, replays, noise)
         for fit in moving:
             _take(
                 fit,
+                replays,
                 [told for (owner, _), told in zip(trials, reached, strict=True) if owner is fit],
             )
+    for fit in fits:
+        _widen(fit)
 
 
 def start_best(
@@ -179,8 +185,30 @@ def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Give fits the Jacobians they need for a step; those that one promises nothing have ended."""
     complete(fits, replays, noise)
     differentiate([f for f in fits if f.thorough and f.age > 0 and _ended(f)], replays, noise)
-    for fit in fits:
-        fit.done = _ended(fit)
+    ended = [fit for fit in fits if _ended(fit)]
+    for fit in ended:
+        _end(fit, replays)
+    narrowed = [fit for fit in ended if not fit.done]
+    if narrowed:
+        _look_around(narrowed, replays, noise)
+
+
+def _end(fit: Fit, replays: Replays) -> None:
+    """End a fit, or let it go on with narrower differences in contact."""
+    if fit.thorough and fit.contact > 1 and replays.measured.grounded.any():
+        fit.contact = max(fit.contact / NARROWER, 1.0)
+        fit.jacobian, fit.stuck, fit.damping = None, 0, Fit.damping
+    else:
+        fit.done = True
+
+
+def _widen(fit: Fit) -> None:
+    """Forget narrow differences: how far a fit may move unnoticed, or imitate what, wide ones tell.
+
+    Narrow ones are of jumps.
+    """
+    if fit.contact < ON_GROUND:
+        fit.jacobian, fit.contact = None, ON_GROUND
 
 
 def _ended(fit: Fit) -> bool:
@@ -210,7 +238,7 @@ def _differences(fit: Fit, at: Array) -> tuple[Array, tuple[Rows, Rows]]:
     Returns:
       The steps, shape (2, n_free), and the columns: in the air, then on the ground.
     """
-    widths = fit.width, min(ON_GROUND * fit.width, WIDEST)
+    widths = fit.width, min(fit.contact * fit.width, 2 * ON_GROUND)
     steps = np.array([[difference(fit, i, at, w) for i in range(len(at))] for w in widths])
 
     def columns(moved: Array) -> Rows:
@@ -348,7 +376,7 @@ class _Reached:
     jacobian: Array | None
 
 
-def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
+def _take(fit: Fit, replays: Replays, reached: Sequence[_Reached]) -> None:
     """Go where a trial is best, or ask for a fresh Jacobian, or stop."""
     costs = [_chi2(fit, told.residual, told.at) for told in reached]
     best = int(np.argmin(costs))
@@ -365,7 +393,7 @@ def _take(fit: Fit, reached: Sequence[_Reached]) -> None:
         fit.damping *= 10 if fit.stuck == 0 else 1000
         fit.stuck += 1
     elif fresh or (fit.moved and not fit.thorough):
-        fit.done = True
+        _end(fit, replays)
     else:
         fit.jacobian = None
         fit.stuck = 0

@@ -12,7 +12,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.beginnings import nearer
+from pup.diagnosis.beginnings import nearer, noise_like
 from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
@@ -21,7 +21,7 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
-from pup.diagnosis.shortlist import shortlist
+from pup.diagnosis.shortlist import in_contact, shortlist
 from pup.diagnosis.starts import (
     Tried,
     closely,
@@ -171,7 +171,7 @@ class Selector:
 
     def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
         """Fits of a model with one effect more, each begun where it is best."""
-        chosen = shortlist(ranking, self.enough)
+        chosen = shortlist(ranking, self.enough, contact=not noise_like(model.fit))
         tried = [
             ((*model.hypotheses, score.trace.hypothesis), started(model.fit, score))
             for score in chosen
@@ -238,7 +238,11 @@ class Selector:
         fit_together(fits, self.replays, self.noise, iterations=FIRST)
         seen = min(fit.chi2 for fit in fits)
         hope = HOPE * (start - seen) + MARGIN
-        promising = [fit for fit in fits if fit is fits[0] or fit.chi2 - seen < hope]
+        promising = [
+            fit
+            for known, fit in tried
+            if fit is fits[0] or fit.chi2 - seen < hope or in_contact(known[-1])
+        ]
         nearer(promising, self.replays, self.noise)
         fit_together(promising, self.replays, self.noise, iterations=ROUGH - FIRST)
         ranked = sorted(tried, key=lambda one: one[1].chi2)

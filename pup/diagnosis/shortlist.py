@@ -3,22 +3,35 @@
 from collections.abc import Sequence
 
 from pup.diagnosis.evidence import Score
-from pup.diagnosis.hypotheses import EVERYWHERE
+from pup.diagnosis.hypotheses import EVERYWHERE, Hypothesis
 from pup.physics.terms import Place
 
 FINALISTS = 8
 """Hypotheses refitted in each round, beside those of the best one's class."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
+IN_CONTACT = frozenset(("ground", "foot", "sensor"))
+"""Kinds of places where slopes say little: impacts come early or late, and a nominal fit that lacks
+a soft floor has led everything else astray."""
 
 
-def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
+def in_contact(hypothesis: Hypothesis) -> bool:
+    """Whether an effect is one of contact, which is looked at by a fit, whatever its score."""
+    return hypothesis.place.kind in IN_CONTACT
+
+
+def shortlist(ranking: Sequence[Score], enough: float, contact: bool = False) -> list[Score]:
     """The best score of each effect and place, as long as it promises enough.
 
     Forms that no refit leads from one to the other are all looked at, and so are effects of the
     best one's class where it acts: a nominal fit may have made up for one of them to first order,
     as damping does for a lag, so that its slope says nothing. What one group shows, all servos may
     have: it is looked at everywhere too.
+
+    Args:
+      ranking: all scores, best first.
+      enough: surprise that chance does not reach.
+      contact: whether all effects of contact are looked at too.
     """
     least = max(enough, WORTH * ranking[0].surprise)
     best: dict[tuple[tuple[str, Place], tuple[float, ...]], Score] = {}
@@ -34,6 +47,7 @@ def shortlist(ranking: Sequence[Score], enough: float) -> list[Score]:
         other = score.trace.hypothesis
         everywhere = other.place.kind in EVERYWHERE
         same = other.place == first.place or (everywhere and first.place.kind in EVERYWHERE)
-        if (other.family == first.family and same) or (everywhere and other.effect in shared):
+        alike = (other.family == first.family and same) or (everywhere and other.effect in shared)
+        if alike or (contact and in_contact(other)):
             best.setdefault((other.key, other.choices), score)
     return list(best.values())
