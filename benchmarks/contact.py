@@ -1,9 +1,10 @@
 """What a diagnosis says of a robot on the ground that has one thing more than its description.
 
-`python -m benchmarks.contact --robots soft slippery` records a virtual quadruped that stands up,
-walks on the spot and sways, each with gains, inertia and a floor of its own, and diagnoses it. What
-is concealed acts as the library has it, at half the time step: this tells whether the search finds
-its way through contact, not whether real floors are named. That blind sets tell.
+`python -m benchmarks.contact --robots soft slippery` records a virtual quadruped, or with `--model`
+another walking robot, that stands up, walks on the spot and sways, each with gains, inertia and a
+floor of its own, and diagnoses it. What is concealed acts as the library has it, at half the time
+step: this tells whether the search finds its way through contact, not whether real floors are
+named. That blind sets tell.
 """
 
 import argparse
@@ -99,11 +100,16 @@ def told(diagnosis: Diagnosis) -> str:
 
 def main() -> None:
     """Diagnose what is asked for, one robot after the other."""
-    robot = RobotDescription.load(str(Path(__file__).parents[1] / "examples" / "quadruped"))
-    known = concealed(robot)
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", nargs="+", choices=known, default=list(known))
-    for name in parser.parse_args().robots:
+    quadruped = str(Path(__file__).parents[1] / "examples" / "quadruped")
+    parser.add_argument("--model", default=quadruped, help="name or folder of the robot")
+    parser.add_argument("--robots", nargs="+", help="what is concealed; default: all")
+    asked = parser.parse_args()
+    robot = RobotDescription.load(asked.model)
+    known = concealed(robot)
+    if strange := sorted({*(asked.robots or ())} - {*known}):
+        parser.error(f"--robots: {', '.join(strange)} unknown; known: {', '.join(known)}")
+    for name in asked.robots or known:
         runs = recorded(robot, known[name], 100 + list(known).index(name))
         begun = time.process_time()
         with threadpool_limits(limits=1):

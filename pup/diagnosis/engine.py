@@ -156,12 +156,14 @@ def diagnose(
     if poor:
         return told("undetermined", poor.reason)
     first = _first_look(followed(nominal, replays), replays, rng, progress, effects)
-    if first is None:
+    contact = bool(measured.grounded.any())
+    if first is None or contact:
         nominal = certified(nominal, replays, rng)
-        if not nominal.certificate.holds:
-            first = _first_look(in_the_air(measured), replays, rng, progress, effects)
+    if first is None and not nominal.certificate.holds:
+        first = _first_look(in_the_air(measured), replays, rng, progress, effects)
     if first is not None:
-        nominal = replace(nominal, certificate=first[0].certificate)
+        whole, some = nominal.certificate, first[0].certificate
+        nominal = replace(nominal, certificate=some.beside(whole) if contact else some)
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
     done = search(replays, nominal, rng, progress, first[1] if first else None, effects)

@@ -70,6 +70,14 @@ class Certificate:
     left: float = np.inf
     samples: int = 0
 
+    def beside(self, whole: "Certificate") -> "Certificate":
+        """That of some recordings, with what a fit to all of them stops short by, in contact.
+
+        A nominal fit that loses track of motions stops shorter than one that does not would: no
+        more counts than a certificate allows.
+        """
+        return replace(self, left=max(self.left, min(whole.left, SHORT * whole.samples)))
+
     @property
     def made(self) -> bool:
         """Whether anything was fitted at all; see `unfitted`."""
