@@ -55,6 +55,7 @@ class Fit:
       chi2: sum of squared weighted residuals, and what it costs to leave what is believed.
       done: whether no step leads further.
       thorough: whether it ends on a Jacobian of where it stands, not on an updated one.
+      narrow: whether it ends on narrow differences in contact.
       damping: of Levenberg and Marquardt.
       age: steps since the Jacobian was fresh.
       width: of its finite differences, in their usual one.
@@ -75,6 +76,7 @@ class Fit:
     chi2: float = np.inf
     done: bool = False
     thorough: bool = True
+    narrow: bool = False
     damping: float = 1e-2
     age: int = 0
     stuck: int = 0
@@ -195,7 +197,7 @@ def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
 
 def _end(fit: Fit, replays: Replays) -> None:
     """End a fit, or let it go on with narrower differences in contact."""
-    if fit.thorough and fit.contact > 1 and replays.measured.grounded.any():
+    if fit.narrow and fit.contact > 1 and replays.measured.grounded.any():
         fit.contact = max(fit.contact / NARROWER, 1.0)
         fit.jacobian, fit.stuck, fit.damping = None, 0, Fit.damping
     else:

@@ -137,6 +137,9 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
     fits = [Fit(coordinates, fit.at) for fit in tried[:2]]
     fit_together(fits, replays, noise)
     nearer(fits, replays, noise)
+    for fit in fits:
+        if ground and not noise_like(fit):
+            fit.narrow, fit.done = True, False
     fit_together(fits, replays, noise)
     for away in NEAR:
         if _agree(*fits):
@@ -251,7 +254,7 @@ def _around(
     Contact has many hollows, and the deepest must draw what is near it.
     """
     places = [best.at + away * rng.normal(size=len(best.at)) for _ in range(2)]
-    others = [Fit(best.coordinates, _within(best.coordinates, at)) for at in places]
+    others = [Fit(best.coordinates, _within(best.coordinates, at), narrow=True) for at in places]
     begun(others[1:], replays, noise)  # how recordings begin may lead to it, or away
     fits = [best, *others]
     fit_together(fits, replays, noise)
@@ -275,7 +278,7 @@ def _refit_of_itself(
     for _ in range(SELVES):  # a kink on the way says nothing of where the way leads
         away = np.clip(4 * deviation, 0.01, 0.15) * rng.choice([-1.0, 1.0], len(fit.at))
         start = _within(fit.coordinates, fit.at + away)
-        own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1)
+        own = Fit(fit.coordinates, start, data=simulated, jacobian=fit.jacobian, age=1, narrow=True)
         if ends:
             begun([own], replays, noise)
         fit_together([own], replays, noise, iterations=8)

@@ -146,5 +146,5 @@ def closely(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Bring fits to their ends, with Jacobians of their own, to be compared with others."""
     for fit in fits:
         fit.thorough, fit.done, fit.jacobian, fit.slack = True, False, None, CLOSELY
-        fit.damping, fit.stuck = Fit.damping, 0
+        fit.damping, fit.stuck, fit.narrow = Fit.damping, 0, True
     fit_together(fits, replays, noise, iterations=LAST)
