@@ -53,9 +53,9 @@ PLACES = 16
 """Places that all effects together may act at."""
 KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""
-FORM = 0.03
+FORM, OF_CONTACT = 0.03, 0.08
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
-is no evidence of another."""
+is no evidence of another. One of contact, even of the same law, is by more at another time step."""
 
 
 class Selector:
@@ -222,8 +222,9 @@ class Selector:
         again = {h.key for h in leading}
         return (*new, *(t for t in old.values() if t.hypothesis.key not in again), *known)
 
-    def blur(self, model: Model, share: float = FORM) -> float:
+    def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
+        share = max(least, OF_CONTACT if any(map(in_contact, model.hypotheses)) else 0.0)
         return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
 
     def _refit(self, tried: Sequence[Tried], start: float) -> None:
