@@ -61,6 +61,18 @@ def test_sound_recordings_are_not_suspected(seed: int) -> None:
     assert why_poor(Measured.of(LEG, leg(seed))) is None
 
 
+def test_late_servos_that_follow_one_another_are_not_exchanged() -> None:
+    """In a gait one joint's commands are another's a moment later, and a servo's lag is one too."""
+    late = 4
+    runs = []
+    for run in leg(noise=0.0):
+        target = np.stack([np.roll(run.target[:, 0], -late * j) for j in range(len(LEG.joints))], 1)
+        position = np.concatenate([np.repeat(target[:1], late, axis=0), target[:-late]])
+        runs.append(replace(run, target=target, position=position))
+    assert np.abs(runs[0].position[8:, 1] - runs[0].target[8:, 0]).max() < 1e-9
+    assert why_poor(Measured.of(LEG, runs)) is None
+
+
 def test_a_noiseless_encoder_at_rest_is_not_clipped() -> None:
     """Steps end where they end, again and again at one reading; so they do in the middle."""
     assert why_poor(Measured.of(LEG, leg(noise=0.0))) is None

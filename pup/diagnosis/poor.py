@@ -34,6 +34,8 @@ FEW = 10
 EXCHANGED = 0.5
 """A joint's readings follow another's commands where they are off by less than this share of what
 they are off from its own."""
+LATEST = 0.2
+"""Lag up to which a servo may follow its own commands, s."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,6 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
             "read at 20 Hz or faster",
         )
     targets = _ordered(measured, [r.target for r in measured.recordings])
-    asked = np.concatenate(targets)
     for j, name in enumerate(measured.robot.joint_names):
         wanted = max(_reach(target[:, j]) for target in targets)
         if wanted >= ASKED * angle and moves[j] < DEAD * wanted:
@@ -97,7 +98,7 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
                 "same value: they are clipped; record with the encoder's whole range",
                 f"with the whole range of the encoder of {name}",
             )
-    exchanged = _exchanged(measured, asked, ASKED * angle)
+    exchanged = _exchanged(measured, targets, ASKED * angle)
     if exchanged:
         yield Poor(
             f"readings of {exchanged[0]} follow the commands of {exchanged[1]}: columns or servo "
@@ -146,17 +147,35 @@ def _clipped(measured: Measured, joint: int, wide: float) -> bool:
     return asked > wide and others < USUAL * ends
 
 
-def _exchanged(measured: Measured, asked: Array, least: float) -> tuple[str, str] | None:
-    """A joint whose readings follow another's commands, and that other."""
+def _exchanged(
+    measured: Measured, targets: Sequence[Array], least: float
+) -> tuple[str, str] | None:
+    """A joint whose readings follow another's commands, and that other.
+
+    Joints that follow one another in time, as in a gait, are told apart by letting each follow its
+    own commands late: a servo that lags is no exchange.
+    """
+    asked = np.concatenate(targets)
+    lags = range(1 + int(LATEST / float(np.median(np.diff(measured.recordings[0].time)))))
     read = np.concatenate(_ordered(measured, [r.position for r in measured.recordings]))
     names = measured.robot.joint_names
 
     def off(joint: int, other: int) -> float:
         return float(np.nanstd(read[:, joint] - asked[:, other]))
 
+    late = [np.concatenate([_later(target, lag) for target in targets]) for lag in lags]
+    own = {
+        joint: min(float(np.nanstd(read[:, joint] - told[:, joint])) for told in late)
+        for joint in range(len(names))
+        if not np.isnan(read[:, joint]).all()
+    }
     for joint, other in permutations(range(len(names)), 2):
-        if _reach(asked[:, other]) < least or np.isnan(read[:, joint]).all():
-            continue
-        if off(joint, other) < EXCHANGED * off(joint, joint):
+        told = joint in own and _reach(asked[:, other]) >= least
+        if told and off(joint, other) < EXCHANGED * own[joint]:
             return names[joint], names[other]
     return None
+
+
+def _later(target: Array, lag: int) -> Array:
+    """Commands so many ticks later, shape (n_ticks, n_joints)."""
+    return np.concatenate([np.repeat(target[:1], lag, axis=0), target])[: len(target)]
