@@ -87,6 +87,8 @@ def test_a_noiseless_encoder_at_rest_is_not_clipped() -> None:
         (lambda runs: changed(runs, PITCH, lambda q: q.clip(-0.15, 0.15)), "l_ank_pitch stop",
          "whole range"),
         (exchanged, "l_knee follow the commands of l_ank_pitch", "servo ids"),
+        (lambda runs: [replace(r, position=0 * r.position) for r in runs],
+         "hardly moves though it is asked to", "mended"),
         (lambda runs: [replace(r, target=0 * r.target + i, position=0 * r.position + i)
                        for i, r in enumerate(runs)],
          "no joint moves", ""),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pup.diagnosis.discover import beside
 from pup.diagnosis.doubts import doubt, left_outside, left_over
 from pup.diagnosis.evidence import Score, Trace
 from pup.diagnosis.fitting import Fit
@@ -126,6 +127,25 @@ def test_what_every_robot_has_a_little_of_comes_after_what_is_of_a_usual_size() 
     clock, ripple = found("clock_skew", 8000.0, 0.2), found("cogging", 400.0, 0.4)
     nameless = found("unknown", 100.0, np.inf)
     assert in_order([clock, ripple, nameless]) == (ripple, nameless, clock)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        (0.83, 0.84, 0.83),
+        (0.6, 0.79, 0.6),
+        (0.95, 0.4, 0.4),
+        (0.33, 0.47, 0.47),
+        (None, 0.97, 0.97),
+    ],
+)
+def test_what_has_no_name_is_no_surer_than_a_name_that_is_likely(
+    name: float | None, before: float, after: float
+) -> None:
+    """Without its steps a servo's strength is anybody's guess, and all left there no evidence."""
+    nameless = found("unknown", 5.0, np.inf, before)
+    named = [] if name is None else [found("actuator_lag", 900.0, 1.0, name)]
+    assert beside(nameless, named).probability == after
 
 
 def test_what_explains_nearly_all_is_first_whatever_its_size() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.discover import Unexplained, unexplained
+from pup.diagnosis.discover import Unexplained, beside, unexplained
 from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import (
     NextRecording,
@@ -206,7 +206,7 @@ def diagnose(
     named = findings(model, rounds, selector, measured, seen) if model.hypotheses else ()
     progress("next recording", 0.95)
     ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
-    nameless = left.finding if left else odd
+    nameless = beside(left.finding, named) if left else odd
     evidence["findings"] = in_order((*named, nameless) if nameless else named)
     return told("mismatch", ask=ask, **evidence)
 

@@ -70,7 +70,9 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
         )
         for j in joints
     ]
-    if max(moves) < MOTION * angle:
+    targets = _ordered(measured, [r.target for r in measured.recordings])
+    wanted = [max(_reach(target[:, j]) for target in targets) for j in joints]
+    if max(moves) < MOTION * angle and max(wanted) < ASKED * angle:
         unit = JointUnits.of(measured.robot, measured.recordings).position
         yield Poor(f"no joint moves by more than {MOTION * angle:.2g} {unit}")
     if len(measured.recordings) < 2:
@@ -83,10 +85,8 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
             "faster",
             "read at 20 Hz or faster",
         )
-    targets = _ordered(measured, [r.target for r in measured.recordings])
     for j, name in enumerate(measured.robot.joint_names):
-        wanted = max(_reach(target[:, j]) for target in targets)
-        if wanted >= ASKED * angle and moves[j] < DEAD * wanted:
+        if wanted[j] >= ASKED * angle and moves[j] < DEAD * wanted[j]:
             yield Poor(
                 f"{name} hardly moves though it is asked to: its encoder is dead or the joint is "
                 "blocked; look at it, or leave these recordings out",
