@@ -73,7 +73,7 @@ class Certificate:
     def beside(self, whole: "Certificate") -> "Certificate":
         """That of some recordings, with what a fit to all of them stops short by, in contact.
 
-        A nominal fit that loses track of motions stops shorter than one that does not would: no
+        A nominal fit that has lost track of motions stops further off than a better one would: no
         more counts than a certificate allows.
         """
         return replace(self, left=max(self.left, min(whole.left, SHORT * whole.samples)))

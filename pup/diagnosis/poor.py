@@ -98,7 +98,7 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
                 "same value: they are clipped; record with the encoder's whole range",
                 f"with the whole range of the encoder of {name}",
             )
-    exchanged = _exchanged(measured, targets, ASKED * angle)
+    exchanged = _exchanged(measured, targets, ASKED * angle, 1 + int(LATEST / apart))
     if exchanged:
         yield Poor(
             f"readings of {exchanged[0]} follow the commands of {exchanged[1]}: columns or servo "
@@ -148,22 +148,21 @@ def _clipped(measured: Measured, joint: int, wide: float) -> bool:
 
 
 def _exchanged(
-    measured: Measured, targets: Sequence[Array], least: float
+    measured: Measured, targets: Sequence[Array], least: float, lags: int
 ) -> tuple[str, str] | None:
     """A joint whose readings follow another's commands, and that other.
 
     Joints that follow one another in time, as in a gait, are told apart by letting each follow its
-    own commands late: a servo that lags is no exchange.
+    own commands late: a servo that lags, by less than so many ticks, is no exchange.
     """
     asked = np.concatenate(targets)
-    lags = range(1 + int(LATEST / float(np.median(np.diff(measured.recordings[0].time)))))
     read = np.concatenate(_ordered(measured, [r.position for r in measured.recordings]))
     names = measured.robot.joint_names
 
     def off(joint: int, other: int) -> float:
         return float(np.nanstd(read[:, joint] - asked[:, other]))
 
-    late = [np.concatenate([_later(target, lag) for target in targets]) for lag in lags]
+    late = [np.concatenate([_later(target, lag) for target in targets]) for lag in range(lags)]
     own = {
         joint: min(float(np.nanstd(read[:, joint] - told[:, joint])) for told in late)
         for joint in range(len(names))
