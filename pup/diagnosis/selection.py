@@ -47,6 +47,8 @@ chi-squared of it."""
 LEADING, MOST = 80, 400
 """Hypotheses that are simulated again around a model that has an effect more: those that looked
 most like its errors before, and so many more where that was no guide."""
+REMEMBERED = 150
+"""Scores of a later round that are kept until the end."""
 ALIKE = 0.8
 """Least cosine of what a hypothesis leaves before and after, for the ranking to be a guide."""
 PLACES = 16
@@ -162,12 +164,13 @@ class Selector:
             self._refit(elsewhere, fit.chi2)
             tried = distinct([*tried, *elsewhere])
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
+        told = _remembered(model, ranking, better)
         if not better:
-            return Round(model, tuple(ranking), (), 0)
+            return Round(model, told, (), 0)
         holds, others = self.parted(model, self.models(better))
         if holds:
             holds[0] = self.ended(holds[0])
-        return Round(model, tuple(ranking), (*holds, *others), len(holds))
+        return Round(model, told, (*holds, *others), len(holds))
 
     def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
         """Fits of a model with one effect more, each begun where it is best."""
@@ -332,6 +335,20 @@ def full(model: Model, most: int) -> bool:
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
     return {hypothesis.effect for hypothesis in hypotheses}
+
+
+def _remembered(
+    model: Model, ranking: Sequence[Score], tried: Sequence[Tried]
+) -> tuple[Score, ...]:
+    """Scores that a round is remembered by; of later ones not all, for traces fill the memory."""
+    if not model.hypotheses:
+        return tuple(ranking)
+    refitted = {known[-1] for known, _ in tried}
+    return tuple(
+        score
+        for rank, score in enumerate(ranking)
+        if rank < REMEMBERED or score.trace.hypothesis in refitted
+    )
 
 
 def _whole(ordered: Sequence[Hypothesis], number: int) -> list[Hypothesis]:
