@@ -100,17 +100,16 @@ def told(diagnosis: Diagnosis) -> str:
 
 def main() -> None:
     """Diagnose what is asked for, one robot after the other."""
-    parser = argparse.ArgumentParser(description=__doc__)
     quadruped = str(Path(__file__).parents[1] / "examples" / "quadruped")
+    names = list(concealed(RobotDescription.load(quadruped)))
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", default=quadruped, help="name or folder of the robot")
-    parser.add_argument("--robots", nargs="+", help="what is concealed; default: all")
+    parser.add_argument("--robots", nargs="+", choices=names, default=names)
     asked = parser.parse_args()
     robot = RobotDescription.load(asked.model)
     known = concealed(robot)
-    if strange := sorted({*(asked.robots or ())} - {*known}):
-        parser.error(f"--robots: {', '.join(strange)} unknown; known: {', '.join(known)}")
-    for name in asked.robots or known:
-        runs = recorded(robot, known[name], 100 + list(known).index(name))
+    for name in asked.robots:
+        runs = recorded(robot, known[name], 100 + names.index(name))
         begun = time.process_time()
         with threadpool_limits(limits=1):
             diagnosis = diagnose(

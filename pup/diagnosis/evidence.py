@@ -5,7 +5,7 @@ is matched with the errors (a Lagrange-multiplier test). Matched filters find tr
 noise. How large the largest of so many scores becomes by chance follows from the traces alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +117,15 @@ def scores(found: Sequence[Trace], residual: Array) -> list[Score]:
             statistic = 0.0
         told.append(Score(trace, statistic, trace.basis.shape[1], sizes))
     return sorted(told, key=lambda s: -s.surprise)
+
+
+def foremost(ranking: Sequence[Score], most: int, refitted: Collection[Hypothesis]) -> list[Score]:
+    """The first scores of a ranking, and those of what was refitted."""
+    return [
+        score
+        for rank, score in enumerate(ranking)
+        if rank < most or score.trace.hypothesis in refitted
+    ]
 
 
 def _sizes(trace: Trace, residual: Array) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
+from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
 from pup.diagnosis.exchanges import RIVALS
 from pup.diagnosis.fitting import Fit, fit_together
 from pup.diagnosis.models import Model, Round
@@ -96,8 +96,7 @@ class Reweighing:
 
     def _ranking(self, chosen: Round, base: Fit) -> tuple[Score, ...]:
         refitted = {m.hypotheses[-1] for m in _worth_keeping(chosen)}
-        ranks = enumerate(chosen.ranking)
-        old = [s for rank, s in ranks if rank < RANKED or s.trace.hypothesis in refitted]
+        old = foremost(chosen.ranking, RANKED, refitted)
         new = scores(self.traces((s.trace for s in old), base), unimitated(base))
         seen = {s.trace.hypothesis for s in new}
         # A finalist that the other noise hides is ranked as it was: its fit is told.

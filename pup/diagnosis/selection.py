@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.beginnings import nearer, noise_like
-from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
+from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
 from pup.diagnosis.gains import explains, material
@@ -227,7 +227,8 @@ class Selector:
 
     def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
-        share = max(least, OF_CONTACT if any(map(in_contact, model.hypotheses)) else 0.0)
+        contact = any(map(in_contact, model.hypotheses))
+        share = max(least, OF_CONTACT) if contact else least
         return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
 
     def _refit(self, tried: Sequence[Tried], start: float) -> None:
@@ -343,12 +344,7 @@ def _remembered(
     """Scores that a round is remembered by; of later ones not all, for traces fill the memory."""
     if not model.hypotheses:
         return tuple(ranking)
-    refitted = {known[-1] for known, _ in tried}
-    return tuple(
-        score
-        for rank, score in enumerate(ranking)
-        if rank < REMEMBERED or score.trace.hypothesis in refitted
-    )
+    return tuple(foremost(ranking, REMEMBERED, {known[-1] for known, _ in tried}))
 
 
 def _whole(ordered: Sequence[Hypothesis], number: int) -> list[Hypothesis]:
