@@ -14,6 +14,7 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.verdict import (
     OTHER_FORM,
+    Alternative,
     Finding,
     Parameter,
     in_order,
@@ -188,3 +189,11 @@ def test_an_interval_is_as_wide_as_a_law_of_another_form_asks() -> None:
     shape = next(q for q in TERMS["stribeck_friction"].quantities if q.shape)
     speed = Parameter(0.1, "rad/s", 0.09, 0.11)
     assert of_other_form(speed, shape) == speed
+
+
+@pytest.mark.parametrize(("other", "after"), [("measurement_delay", 0.47), ("cogging", 0.65)])
+def test_a_name_is_as_likely_as_its_class(other: str, after: float) -> None:
+    """A lag that is told as late commands or as late readings is late, whatever has no name."""
+    twin = Alternative(other, Place("joint", BENCH.joint_names[0]), 0.44)
+    late = replace(found("command_delay", 900.0, 1.0, 0.47), equivalents=(twin,))
+    assert beside(found("unknown", 5.0, np.inf, 0.65), [late]).probability == after

@@ -80,3 +80,9 @@ def noise_like(fit: Fit) -> bool:
     """Whether a fit leaves no more than noise: then it has not stopped short by much."""
     assert fit.residual is not None
     return fit.chi2 <= (1 + SPARE) * len(fit.residual)
+
+
+def spare(fit: Fit) -> float:
+    """Chi-squared that anything more could still lower: what a fit to the noise leaves stays."""
+    assert fit.residual is not None
+    return fit.chi2 - (1 - SPARE) * len(fit.residual)

@@ -36,7 +36,7 @@ SURPRISE = 4.5
 MATERIAL = 0.09
 """Mean square of a channel's unexplained errors, in that of its noise, that matters."""
 LIKELY = 0.5
-"""Probability from which a name is more likely than not."""
+"""Probability from which something of a class is more likely there than not."""
 FORM = 0.05
 """Share of its own trace that a wrong form of a known effect may leave."""
 ROUGH = 5
@@ -130,14 +130,12 @@ def unexplained(
 
 
 def beside(nameless: Finding, named: Sequence[Finding]) -> Finding:
-    """What has no name beside what has one: no surer than a name that is more likely than not.
+    """What has no name beside what has one: no surer than a name whose class is likely.
 
     How much a name leaves on motions that were left out may only say that no other motion tells how
     strong a servo is, or that the effect has a form of its own: of that name it is a part.
     """
-    surest = max((f.probability for f in named), default=0.0)
-    if surest < LIKELY:
-        return nameless
+    surest = max((f.probability for f in named if f.of_class >= LIKELY), default=1.0)
     return replace(nameless, probability=min(nameless.probability, surest))
 
 

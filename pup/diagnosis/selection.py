@@ -12,7 +12,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.beginnings import nearer, noise_like
+from pup.diagnosis.beginnings import nearer, noise_like, spare
 from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
@@ -152,6 +152,8 @@ class Selector:
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
+        if spare(fit) < self.blur(model):
+            return None  # all that is left may be the forms of what was found
         ranking = scores(self._traces(model), unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
             return None

@@ -87,6 +87,13 @@ class Finding:
     """Of its largest magnitude, in what is typical of its kind; infinite of what has no kind."""
 
     @property
+    def of_class(self) -> float:
+        """Probability of something of its class, whatever its form."""
+        own = CLASS_OF.get(self.effect)
+        alike = (e.probability for e in self.equivalents if CLASS_OF.get(e.effect) == own)
+        return self.probability + sum(alike)
+
+    @property
     def believed(self) -> bool:
         """Whether it or what it cannot be told from is more likely there than not."""
         return self.probability + sum(e.probability for e in self.equivalents) > 0.5
