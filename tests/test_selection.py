@@ -26,6 +26,7 @@ FIRST, RIVAL, OTHER, LAST = (
     next(h for h in hypotheses(MAKER.measured) if h.effect == effect)
     for effect in ("coulomb_friction", "quadratic_damping", "armature", "command_delay")
 )
+SOFT = Hypothesis("ground_compliance", Place("ground"), FIRST.scale)
 Worths = Mapping[tuple[Hypothesis, ...], float]
 
 
@@ -248,3 +249,21 @@ def test_rivals_of_other_classes_are_compared_as_closely_as_the_best(
     fits[-1].chi2 = 6000.0
     Made({})._refit([((h,), fit) for h, fit in zip(known, fits, strict=True)], 9000.0)
     assert [fit.chi2 for fit in ended] == [fit.chi2 for fit in fits[:-1]]
+
+
+@pytest.mark.parametrize(
+    ("known", "left", "begun"), [(SOFT, 1.05, False), (SOFT, 1.6, True), (FIRST, 1.05, True)]
+)
+def test_no_round_begins_where_the_form_of_what_was_found_may_leave_all_that_is_left(
+    monkeypatch: pytest.MonkeyPatch, known: Hypothesis, left: float, begun: bool
+) -> None:
+    """A soft floor at another time step leaves a tenth of its trace, in which anything is seen."""
+    asked: list[object] = []
+    monkeypatch.setattr(selection, "scores", lambda *told: asked.append(told) or [])
+    monkeypatch.setattr(selection, "unimitated", nothing)
+    monkeypatch.setattr(Made, "_traces", nothing)
+    selector = Made({})
+    selector.nominal = made((), 40.0 * MAKER.samples)
+    model = made((FIRST,), left * MAKER.samples)
+    assert selector._round(replace(model, hypotheses=(known,))) is None
+    assert bool(asked) is begun

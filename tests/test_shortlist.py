@@ -1,10 +1,15 @@
 """Which effects are refitted: of each the best form, and everywhere what a group shows."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
 
 from pup.diagnosis.evidence import Score, Trace
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import Hypothesis
-from pup.diagnosis.shortlist import FINALISTS, shortlist
+from pup.diagnosis.shortlist import FINALISTS, shortlist, suspected
 from pup.physics.terms import Place
 from pup.physics.terms.scale import Scale
 from pup.robot import RobotDescription
@@ -63,3 +68,24 @@ def test_effects_of_contact_are_looked_at_whatever_they_promise() -> None:
     assert chosen(*ranking) == [first.trace.hypothesis.key]
     told = [s.trace.hypothesis.key for s in shortlist(ranking, 15.0, contact=True)]
     assert told[1:] == [s.trace.hypothesis.key for s in effects]
+
+
+@pytest.mark.parametrize(
+    ("air", "ground", "expected"),
+    [
+        (1.22, 6.27, True),  # a soft floor under a quadruped
+        (6.74, 54.4, True),  # one that leans: nominal fits take errors of contact into the air
+        (None, 6.27, True),
+        (40.0, 90.0, False),  # servos that are weaker with speed, hung up and on the ground
+        (5.0, None, False),
+        (1.0, 1.01, False),
+    ],
+)
+def test_contact_is_suspected_where_motions_on_the_ground_are_worse(
+    air: float | None, ground: float | None, expected: bool
+) -> None:
+    told = [(a, g) for a, g in ((air, False), (ground, True)) if a is not None]
+    measured: Any = SimpleNamespace(grounded=np.repeat([g for _, g in told], 100))
+    residual = np.repeat([np.sqrt(a) for a, _ in told], 100)
+    fit = Fit((), np.empty(0), residual=residual, chi2=float(residual @ residual))
+    assert suspected(fit, measured) is expected

@@ -12,7 +12,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.beginnings import nearer, noise_like, spare
+from pup.diagnosis.beginnings import nearer, spare
 from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
 from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
@@ -21,7 +21,7 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
-from pup.diagnosis.shortlist import in_contact, shortlist
+from pup.diagnosis.shortlist import in_contact, shortlist, suspected
 from pup.diagnosis.starts import (
     Tried,
     closely,
@@ -176,7 +176,8 @@ class Selector:
 
     def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
         """Fits of a model with one effect more, each begun where it is best."""
-        chosen = shortlist(ranking, self.enough, contact=not noise_like(model.fit))
+        contact = suspected(model.fit, self.replays.measured)
+        chosen = shortlist(ranking, self.enough, contact)
         tried = [
             ((*model.hypotheses, score.trace.hypothesis), started(model.fit, score))
             for score in chosen

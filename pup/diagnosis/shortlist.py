@@ -2,8 +2,11 @@
 
 from collections.abc import Sequence
 
+from pup.diagnosis.beginnings import SPARE, noise_like
 from pup.diagnosis.evidence import Score
+from pup.diagnosis.fitting import Fit
 from pup.diagnosis.hypotheses import EVERYWHERE, Hypothesis
+from pup.diagnosis.residuals import Measured
 from pup.physics.terms import Place
 
 FINALISTS = 8
@@ -14,10 +17,28 @@ IN_CONTACT = frozenset(("ground", "foot", "sensor"))
 """Kinds of places where slopes say little: impacts come early or late, and a nominal fit that lacks
 a soft floor has led everything else astray."""
 
+GROUNDED = 4.0
+"""Contact is suspected where motions on the ground are so many times as far off as those in the
+air: 9 times or more where it was (docs/results/diagnosis.md)."""
+
 
 def in_contact(hypothesis: Hypothesis) -> bool:
     """Whether an effect is one of contact, which is looked at by a fit, whatever its score."""
     return hypothesis.place.kind in IN_CONTACT
+
+
+def suspected(fit: Fit, measured: Measured) -> bool:
+    """Whether contact may be what a fit lacks: motions in the air, if any, are followed better.
+
+    What is off in the air as well is something else, which is looked for first.
+    """
+    assert fit.residual is not None
+    ground = measured.grounded
+    if noise_like(fit) or not ground.any():
+        return False
+    squares = fit.residual**2 - 1
+    air = float(squares[~ground].mean()) if not ground.all() else 0.0
+    return float(squares[ground].mean()) > GROUNDED * max(air, SPARE)
 
 
 def shortlist(ranking: Sequence[Score], enough: float, contact: bool = False) -> list[Score]:
