@@ -10,6 +10,7 @@ from pup.diagnosis.discover import Unexplained
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Trace, scores
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.held_out import held_out
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.impulses import WRENCH_NAMES
 from pup.diagnosis.lacks import Lack
@@ -20,7 +21,7 @@ from pup.diagnosis.nominal import Certificate, Nominal, free_names
 from pup.diagnosis.regimes import Regime, Window
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.splits import Ratio, Split
-from pup.diagnosis.verdict import Alternative, Finding, Parameter, held_out
+from pup.diagnosis.verdict import Alternative, Finding, Parameter
 from pup.physics.parameters import robot_space
 from pup.physics.terms import TERMS, Place
 from pup.physics.terms.learned import LearnedLaw, unit

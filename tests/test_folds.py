@@ -9,8 +9,8 @@ import numpy as np
 from scipy import stats
 
 from pup.diagnosis.folds import folds, scatter
+from pup.diagnosis.held_out import held_out
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.verdict import held_out
 from pup.recording import Recording
 from pup.robot import RobotDescription
 from tests.diagnoses import Maker

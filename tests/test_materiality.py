@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pup.diagnosis.held_out import HeldOut
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.materiality import little, matters
 from pup.diagnosis.models import Model
-from pup.diagnosis.verdict import HeldOut
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
 from tests.diagnoses import SIGMA, Maker

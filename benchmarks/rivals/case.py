@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fitting import Fit
+from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.models import Model
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal
@@ -18,7 +19,7 @@ from pup.diagnosis.pieces import pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector
-from pup.diagnosis.verdict import Alternative, Finding, HeldOut, held_out
+from pup.diagnosis.verdict import Alternative, Finding
 from pup.physics.parameters import robot_space
 from pup.physics.terms import Place
 from pup.recording import Recording

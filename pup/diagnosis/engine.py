@@ -17,6 +17,7 @@ from pup.diagnosis.experiment import (
     rivals_of,
 )
 from pup.diagnosis.fitting import Fit, complete, differentiate, fit_together
+from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.locate import MissingInput, missing_input
 from pup.diagnosis.materiality import improves, little, matters
@@ -32,7 +33,7 @@ from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.search import Search, followed, in_the_air, search, search_on
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.splits import Split, splits
-from pup.diagnosis.verdict import Answer, Finding, HeldOut, findings, held_out, in_order
+from pup.diagnosis.verdict import Answer, Finding, findings, in_order
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space
 from pup.recording import Recording

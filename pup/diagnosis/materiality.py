@@ -10,9 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.held_out import HeldOut
 from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import TILTS, Noise
-from pup.diagnosis.verdict import SLIGHT, HeldOut
+from pup.diagnosis.verdict import SLIGHT
 
 Array = NDArray[np.float64]
 
