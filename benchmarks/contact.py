@@ -48,7 +48,7 @@ def concealed(robot: RobotDescription) -> dict[str, TermSpec | None]:
 def motions(robot: RobotDescription) -> list[Motion]:
     """Two in the air, and on the ground standing up, walking on the spot and swaying."""
     told = script(robot, ("step:0.3", "chirp", "standup:2"), np.random.default_rng(1))
-    return [*map(_beginning, told), _walk(robot), _sway(robot)]
+    return [*map(_beginning, told), walk_on_the_spot(robot), _sway(robot)]
 
 
 def _beginning(motion: Motion) -> Motion:
@@ -56,7 +56,7 @@ def _beginning(motion: Motion) -> Motion:
     return replace(motion, time=motion.time[kept], target=motion.target[kept])
 
 
-def _walk(robot: RobotDescription) -> Motion:
+def walk_on_the_spot(robot: RobotDescription) -> Motion:
     assert robot.gait is not None
     ticks, stand = np.arange(0, LONGEST - 1, PERIOD), np.array(robot.poses["stand"])
     gait = robot.gait.angles(np.maximum((ticks - LEAD) / robot.gait.period, 0.0))
