@@ -86,11 +86,11 @@ def main() -> None:
         joints, tilts = moved(plant, motion)
         for i, seed in enumerate(asked.seeds):
             own, *others = range(len(KINDS) * i, len(KINDS) * (i + 1))
-            told = [
+            apart = [
                 f"{kind} {_apart(joints, tilts, own, lane)}"
                 for kind, lane in zip(KINDS[1:], others, strict=True)
             ]
-            print(f"{seed} {motion.id}: {', '.join(told)}", flush=True)
+            print(f"{seed} {motion.id}: {', '.join(apart)}", flush=True)
 
 
 def _apart(joints: Array, tilts: Array, one: int, other: int) -> str:
