@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis, diagnose
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.replays import Bench, Replays, Runner, threads
 from pup.diagnosis.report import write_report
 from pup.diagnosis.residuals import Measured

@@ -9,7 +9,7 @@ from pup.diagnosis.coordinates import nominal_coordinate, term_coordinate
 from pup.diagnosis.discover import Unexplained
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Trace, scores
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.held_out import held_out
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.impulses import WRENCH_NAMES

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import Fit, differentiate, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import differentiate, fit_together
 from pup.diagnosis.nominal import free_names
 from pup.diagnosis.replays import Bench, Replays, threads, union
 from pup.diagnosis.residuals import Measured, Noise

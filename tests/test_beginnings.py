@@ -7,14 +7,8 @@ from numpy.typing import NDArray
 from pup.diagnosis import fitting
 from pup.diagnosis.beginnings import nearer
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import (
-    ON_GROUND,
-    STEP,
-    Fit,
-    difference,
-    differentiate,
-    fit_together,
-)
+from pup.diagnosis.fit import WIDE, Fit
+from pup.diagnosis.fitting import STEP, WIDE, difference, differentiate, fit_together
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
@@ -82,13 +76,13 @@ def test_a_fit_in_contact_ends_on_narrow_slopes_and_forgets_them(
     fit.narrow = True
     fit_together([fit], replays, noise)
     in_contact = asked[1::2]  # each time in the air first
-    assert in_contact[0] == ON_GROUND and in_contact[-1] == 1.0
+    assert in_contact[0] == WIDE and in_contact[-1] == 1.0
     assert in_contact == sorted(in_contact, reverse=True)
     assert fit.done and fit.at[0] == pytest.approx(there, abs=0.005)
     assert fit.jacobian is None
     asked.clear()
     differentiate([fit], replays, noise)
-    assert asked[1::2] == [ON_GROUND]
+    assert asked[1::2] == [WIDE]
 
 
 def test_another_keeps_to_wide_slopes() -> None:

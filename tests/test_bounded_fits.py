@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from pup.diagnosis.coordinates import Belief, Coordinate
 from pup.diagnosis.evidence import Projector
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.folds import left_out
 
 SAMPLES = 60

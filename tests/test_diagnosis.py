@@ -12,7 +12,8 @@ from pup.diagnosis import selection
 from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.engine import Diagnosis, diagnose
 from pup.diagnosis.evidence import Projector, Trace, scores, threshold
-from pup.diagnosis.fitting import ENOUGH, Fit, fit_together
+from pup.diagnosis.fit import ENOUGH, Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.noise import noise_floor, quanta, quiet_noise
 from pup.diagnosis.replays import Batch, Bench, Replays, threads

@@ -8,7 +8,7 @@ import pytest
 from terms import BENCH, SERVO, steps, with_terms
 
 from pup.diagnosis.discover import unexplained
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.lacks import Lack
 from pup.diagnosis.selection import Selector
 from pup.physics.mujoco_batch import MujocoSimulator

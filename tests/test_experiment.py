@@ -12,7 +12,7 @@ from pup.diagnosis.experiment import (
     recorded_again,
     recorded_besides,
 )
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.menu import options
 from pup.diagnosis.residuals import Noise
 from pup.physics.terms import Place, column

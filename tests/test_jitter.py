@@ -5,7 +5,7 @@ import pytest
 
 from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.doubts import unexplained_errors
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.lacks import repeated

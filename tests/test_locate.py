@@ -6,7 +6,7 @@ from terms import BENCH, LEG, OP2, SERVO, held, with_terms
 from test_simulator import recording
 
 from pup.diagnosis.banded import Chain
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.impulses import responses
 from pup.diagnosis.locate import BAND, explained_by, missing_input
 from pup.diagnosis.splits import splits

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.impulses import responses
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.probing import probed

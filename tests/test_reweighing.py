@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.noise import assumed_noise, told_anew
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal
 from pup.diagnosis.replays import Bench, Replays, threads

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, origins, pieces

@@ -11,7 +11,7 @@ import pytest
 from pup.diagnosis import exchanges, selection
 from pup.diagnosis.evidence import Projector, Trace
 from pup.diagnosis.exchanges import Exchanger
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import LOST

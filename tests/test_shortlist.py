@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.evidence import Score, Trace
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.shortlist import FINALISTS, shortlist, suspected
 from pup.physics.terms import Place

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import Fit, complete, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import complete, fit_together
 from pup.diagnosis.folds import NOMINAL, without_samples
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.noise import assumed_noise

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.coordinates import nominal_coordinate
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.hypotheses import MODERATE, Hypothesis, hypotheses
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.replays import Bench, Replays, threads

@@ -8,7 +8,7 @@ import pytest
 from pup.diagnosis.discover import beside
 from pup.diagnosis.doubts import doubt, left_outside, left_over
 from pup.diagnosis.evidence import Score, Trace
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.models import Model
 from pup.diagnosis.noise import assumed_noise

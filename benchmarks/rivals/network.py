@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.rivals.case import SEED, Case, Named, Verdict
 from benchmarks.rivals.torques import Seen, seen
 from pup.diagnosis.coordinates import Coordinate
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.folds import folds
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.residuals import LOST

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.rivals.case import Case, Named, Verdict
 from pup.diagnosis.coordinates import term_coordinate
-from pup.diagnosis.fitting import Fit, fit_together, start_best
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together, start_best
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.starts import ROUGHLY
 from pup.diagnosis.verdict import WORTH_SAYING

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import Fit, fit_together, start_best
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together, start_best
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.doubts import UNKNOWN, doubt, left_outside, left_over, unexplained_errors
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.impulses import BUDGET, responses
 from pup.diagnosis.lacks import Lack, lack_of_fit
 from pup.diagnosis.lawfit import LAWS, Law, laws

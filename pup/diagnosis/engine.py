@@ -16,7 +16,8 @@ from pup.diagnosis.experiment import (
     recorded_besides,
     rivals_of,
 )
-from pup.diagnosis.fitting import Fit, complete, differentiate, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import complete, differentiate, fit_together
 from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.locate import MissingInput, missing_input

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import Fit, fit_together, start_best
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together, start_best
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.models import Model, Round, chosen_in, last_rounds
 from pup.diagnosis.selection import MARGIN, ROUGH, Selector

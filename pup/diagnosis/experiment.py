@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import term_coordinate
-from pup.diagnosis.fitting import Fit, difference, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import difference, fit_together
 from pup.diagnosis.laws import WORDS, contract_name
 from pup.diagnosis.menu import CHANGED, SCRIPTS, Option, options
 from pup.diagnosis.models import Round

@@ -5,13 +5,13 @@ an effect's magnitudes in their typical sizes. Jacobians by differences are refr
 Broyden's update of them leads no further, as a replay is all the cost there is.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.coordinates import Belief, Coordinate
+from pup.diagnosis.fit import ALMOST, WIDE, Fit
 from pup.diagnosis.probing import changes, probed
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
@@ -22,114 +22,18 @@ Rows = list[dict[str, float]]
 
 STEP = 0.0004
 """Finite-difference step, of a coordinate."""
-ON_GROUND, NARROWER = 50.0, 7.1
-"""The same in contact, in that step, and how many times narrower it then gets: impacts make
-trajectories jump by a hair of time. Slopes across 2 % lead over the jumps, and narrow ones to the
-bottom of the hollow that they lead to."""
+NARROWER = 7.1
+"""So many times narrower differences in contact get: impacts make trajectories jump by a hair of
+time. Slopes across 2 % lead over the jumps, and narrow ones to the bottom of the hollow that they
+lead to."""
 DAMPINGS, HEAVIER = (0.1,), (1.0, 10.0, 100.0)
 """Tried at once, relative to the current one: at first, and where that led nowhere."""
-ENOUGH = 0.2
-"""A fit has ended when no step lowers chi-squared by as much."""
-ALMOST = 1e-9
 CHEAP = 100
 """Simulations that a replay may have beside those it needs, for Jacobians of its trials."""
 RELIABLE = 0.5
 """Share of what it promised that a step must gain for its Jacobian to be kept."""
 PATIENCE = 2
 """Accepted steps for which an updated Jacobian is trusted."""
-
-
-@dataclass
-class Fit:
-    """A least-squares fit under way.
-
-    Attributes:
-      coordinates: what is free.
-      at: where it stands, shape (n_free,).
-      fixed: other parameters that differ from their nominal values.
-      weight: of the samples, shape (n_samples,): 0 leaves one out.
-      data: what it fits, shape (n_samples,), rad; None for what was measured.
-      belief: where it is believed to lie; None where the samples alone say so.
-      residual: whitened, measured minus simulated, shape (n_samples,).
-      jacobian: of the simulated samples, whitened, shape (n_samples, n_free).
-      chi2: sum of squared weighted residuals, and what it costs to leave what is believed.
-      done: whether no step leads further.
-      thorough: whether it ends on a Jacobian of where it stands, not on an updated one.
-      narrow: whether it ends on narrow differences in contact.
-      damping: of Levenberg and Marquardt.
-      age: steps since the Jacobian was fresh.
-      width: of its finite differences, in their usual one.
-      contact: the same of recordings in contact, in that one.
-      slack: relative gain of chi-squared below which it has ended.
-      stuck: times in a row that no trial was better.
-      moved: whether any was so far.
-    """
-
-    coordinates: tuple[Coordinate, ...]
-    at: Array
-    fixed: Mapping[str, float] = field(default_factory=dict)
-    weight: Array | None = None
-    data: Array | None = None
-    belief: Belief | None = None
-    residual: Array | None = None
-    jacobian: Array | None = None
-    chi2: float = np.inf
-    done: bool = False
-    thorough: bool = True
-    narrow: bool = False
-    damping: float = 1e-2
-    age: int = 0
-    stuck: int = 0
-    moved: bool = False
-    width: float = 1.0
-    contact: float = ON_GROUND
-    slack: float = 1e-5
-
-    @property
-    def least(self) -> float:
-        """Gain of chi-squared that counts."""
-        return max(ENOUGH, self.slack * self.chi2)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return tuple(c.name for c in self.coordinates)
-
-    def row(self, at: Array | None = None) -> dict[str, float]:
-        """The candidate at some coordinates; where the fit stands when none are given."""
-        where = self.at if at is None else at
-        free = {c.name: c.value(x) for c, x in zip(self.coordinates, where, strict=True)}
-        return {**self.fixed, **free}
-
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameters that are not nominal."""
-        return self.row()
-
-    @property
-    def slopes(self) -> Array:
-        """The Jacobian's columns of what can move, shape (n_samples, n_movable).
-
-        A coordinate that the data press against an end of its range stays there, and imitates
-        nothing of what they ask for beyond it.
-        """
-        assert self.jacobian is not None
-        return self.jacobian[:, self.movable]
-
-    @property
-    def movable(self) -> NDArray[np.bool_]:
-        """Whether each coordinate can go where chi-squared is lower, shape (n_free,)."""
-        downhill = _downhill(self)
-        above = self.at > np.array([c.upper for c in self.coordinates]) - ALMOST
-        below = self.at < np.array([c.lower for c in self.coordinates]) + ALMOST
-        return ~(above & (downhill > 0) | below & (downhill < 0))
-
-    def covariance(self) -> Array:
-        """Of the coordinates, shape (n_free, n_free); what the data do not see has its range."""
-        assert self.jacobian is not None
-        weighted = self.jacobian if self.weight is None else self.jacobian * self.weight[:, None]
-        span = np.array([c.upper - c.lower for c in self.coordinates])
-        return np.asarray(np.linalg.inv(weighted.T @ weighted + np.diag(12 / span**2)))
 
 
 def fit_together(fits: Sequence[Fit], replays: Replays, noise: Noise, iterations: int = 12) -> None:
@@ -178,7 +82,7 @@ def start_best(
     simulated = replays([fit.row(at) for fit, at in tried])
     residuals = _residuals([fit for fit, _ in tried], simulated, replays, noise)
     for (fit, at), residual in zip(tried, residuals, strict=True):
-        chi2 = _chi2(fit, residual, at)
+        chi2 = fit.cost(residual, at)
         if chi2 < fit.chi2:
             fit.at, fit.residual, fit.chi2 = at, residual, chi2
 
@@ -209,13 +113,13 @@ def _widen(fit: Fit) -> None:
 
     Narrow ones are of jumps.
     """
-    if fit.contact < ON_GROUND:
-        fit.jacobian, fit.contact = None, ON_GROUND
+    if fit.contact < WIDE:
+        fit.jacobian, fit.contact = None, WIDE
 
 
 def _ended(fit: Fit) -> bool:
     """Whether the Jacobian promises no gain that counts."""
-    return _promise(fit, _trials(fit)[0]) < fit.least
+    return fit.promise(_trials(fit)[0]) < fit.least
 
 
 def complete(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
@@ -240,7 +144,7 @@ def _differences(fit: Fit, at: Array) -> tuple[Array, tuple[Rows, Rows]]:
     Returns:
       The steps, shape (2, n_free), and the columns: in the air, then on the ground.
     """
-    widths = fit.width, min(fit.contact * fit.width, 2 * ON_GROUND)
+    widths = fit.width, min(fit.contact * fit.width, 2 * WIDE)
     steps = np.array([[difference(fit, i, at, w) for i in range(len(at))] for w in widths])
 
     def columns(moved: Array) -> Rows:
@@ -284,7 +188,7 @@ def _begin(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     told = probed([(fit.row(), *d[1]) for fit, d in zip(fits, asked, strict=True)], replays)
     residuals = _residuals(fits, np.stack([base for base, _ in told]), replays, noise)
     for fit, residual, (steps, _), (_, changed) in zip(fits, residuals, asked, told, strict=True):
-        fit.residual, fit.chi2 = residual, _chi2(fit, residual, fit.at)
+        fit.residual, fit.chi2 = residual, fit.cost(residual, fit.at)
         if fit.jacobian is None:
             fit.jacobian, fit.age = _jacobian(steps, changed, replays, noise), 0
 
@@ -297,11 +201,6 @@ def _residuals(fits: Sequence[Fit], simulated: Array, replays: Replays, noise: N
     return measured.whiten(errors, noise)
 
 
-def _chi2(fit: Fit, residual: Array, at: Array) -> float:
-    weighted = residual if fit.weight is None else residual * fit.weight
-    return float(weighted @ weighted) + (fit.belief.cost(at) if fit.belief else 0.0)
-
-
 def difference(fit: Fit, i: int, at: Array, width: float) -> float:
     """A step of a coordinate into its range, for a slope; so many times as wide as usual."""
     coordinate = fit.coordinates[i]
@@ -311,7 +210,7 @@ def difference(fit: Fit, i: int, at: Array, width: float) -> float:
 
 def _trials(fit: Fit) -> list[Array]:
     """Where damped Gauss-Newton steps lead, the least damped first."""
-    normal, gradient = _normal(fit)
+    normal, gradient = fit.normal(), fit.downhill()
     lower = np.array([c.lower for c in fit.coordinates])
     upper = np.array([c.upper for c in fit.coordinates])
     scale = np.maximum(np.diag(normal), 1e-6 * max(float(np.diag(normal).max()), 1e-300))
@@ -324,31 +223,6 @@ def _trials(fit: Fit) -> list[Array]:
 
 def _dampings(fit: Fit) -> tuple[float, ...]:
     return HEAVIER if fit.stuck else DAMPINGS
-
-
-def _normal(fit: Fit) -> tuple[Array, Array]:
-    """The normal matrix, and half of chi-squared's slope downhill."""
-    assert fit.jacobian is not None
-    jacobian = fit.jacobian if fit.weight is None else fit.jacobian * fit.weight[:, None]
-    normal = jacobian.T @ jacobian
-    if fit.belief:
-        normal[np.diag_indices_from(normal)] += fit.belief.precision
-    return normal, _downhill(fit)
-
-
-def _downhill(fit: Fit) -> Array:
-    """Half of chi-squared's slope downhill, shape (n_free,)."""
-    assert fit.jacobian is not None and fit.residual is not None
-    squares = 1.0 if fit.weight is None else fit.weight**2
-    pull = fit.belief.pull(fit.at) if fit.belief else 0.0
-    return np.asarray(fit.jacobian.T @ (fit.residual * squares) + pull)
-
-
-def _promise(fit: Fit, to: Array) -> float:
-    """Gain of chi-squared at a point, as the Jacobian has it."""
-    normal, gradient = _normal(fit)
-    step = to - fit.at
-    return float(2 * gradient @ step - step @ normal @ step)
 
 
 def _bounded(system: Array, gradient: Array, at: Array, lower: Array, upper: Array) -> Array:
@@ -380,10 +254,10 @@ class _Reached:
 
 def _take(fit: Fit, replays: Replays, reached: Sequence[_Reached]) -> None:
     """Go where a trial is best, or ask for a fresh Jacobian, or stop."""
-    costs = [_chi2(fit, told.residual, told.at) for told in reached]
+    costs = [fit.cost(told.residual, told.at) for told in reached]
     best = int(np.argmin(costs))
     gain, fresh = fit.chi2 - costs[best], fit.age == 0
-    kept = gain > RELIABLE * _promise(fit, reached[best].at)
+    kept = gain > RELIABLE * fit.promise(reached[best].at)
     if gain > 0:
         _go(fit, reached[best], costs[best])
         fit.damping = float(np.clip(fit.damping * _dampings(fit)[best], 1e-6, 1e6))

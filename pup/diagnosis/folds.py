@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pup.diagnosis.coordinates import Belief, Coordinate
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.residuals import Measured
 from pup.physics.terms import Place

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.probing import coupled
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured, Noise

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import Coordinate
 from pup.diagnosis.evidence import Projector
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.impulses import Responses
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.signals import Servo, servos, signals

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.banded import Chain, Factor
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.impulses import BUDGET, Part, Responses, responses
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.beginnings import SPARE, begun, moved, nearer, noise_like
 from pup.diagnosis.coordinates import Coordinate, described_at, nominal_coordinate
-from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import complete, fit_together, start_best
 from pup.diagnosis.noise import noise_floor
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise

@@ -6,7 +6,7 @@ import numpy as np
 
 from pup.diagnosis import summary
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.folds import fold_words
 from pup.diagnosis.nominal import SELF
 from pup.diagnosis.wording import Speech, capital, change, digits, parameter_words

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
 from pup.diagnosis.exchanges import RIVALS
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector, unimitated

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import Coordinate, nominal_coordinate
 from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured

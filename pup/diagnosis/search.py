@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Trace, threshold, traced
 from pup.diagnosis.exchanges import Exchanger
-from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import complete, fit_together, start_best
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Nominal, floors

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.beginnings import nearer, spare
 from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
-from pup.diagnosis.fitting import Fit, complete, fit_together, start_best
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
 from pup.diagnosis.gains import explains, material
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from pup.diagnosis.beginnings import SPARE, noise_like
 from pup.diagnosis.evidence import Score
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import EVERYWHERE, Hypothesis
 from pup.diagnosis.residuals import Measured
 from pup.physics.terms import Place

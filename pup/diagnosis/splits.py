@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pup.diagnosis.evidence import Projector
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.signals import Servo, servos, signals

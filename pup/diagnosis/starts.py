@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import described_at, term_coordinate
 from pup.diagnosis.evidence import Score
-from pup.diagnosis.fitting import Fit, fit_together
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise

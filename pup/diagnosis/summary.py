@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Score, Trace, overlap, scores
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.gains import MATERIAL
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.models import Model, Round

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Trace, scores, traced
-from pup.diagnosis.fitting import Fit
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import MODERATE, Hypothesis
 from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Replays
