@@ -8,7 +8,7 @@ from pup.diagnosis import fitting
 from pup.diagnosis.beginnings import nearer
 from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fit import WIDE, Fit
-from pup.diagnosis.fitting import STEP, WIDE, difference, differentiate, fit_together
+from pup.diagnosis.fitting import STEP, difference, differentiate, fit_together
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
