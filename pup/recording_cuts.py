@@ -90,3 +90,13 @@ def thinned(recording: Recording, every: int) -> Recording:
     dropped = np.arange(len(position)) % every != 0
     position[dropped] = np.nan
     return replace(recording, position=position)
+
+
+def between(time: Array, readings: Array) -> Array:
+    """Readings (n_ticks, n_joints) with lines through the ticks that have none; NaN without any."""
+    told = readings.copy()
+    for column in told.T:
+        read = ~np.isnan(column)
+        if read.any():
+            column[~read] = np.interp(time[~read], time[read], column[read])
+    return told

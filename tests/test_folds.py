@@ -12,6 +12,7 @@ from pup.diagnosis.folds import folds, scatter
 from pup.diagnosis.held_out import held_out
 from pup.diagnosis.residuals import Measured
 from pup.recording import Recording
+from pup.recording_cuts import beginning
 from pup.robot import RobotDescription
 from tests.diagnoses import Maker
 from tests.diagnosis_cases import BENCH, recordings
@@ -33,6 +34,12 @@ def test_a_motion_done_again_is_left_out_with_it() -> None:
     assert left_out(alike[:2]) == [[0], [1]]  # there is nothing else
 
 
+def test_what_has_no_sample_is_not_left_out() -> None:
+    """A motion that is over before anything is told would be one of two folds, and empty."""
+    over = beginning(RUNS[2], 0.0)
+    assert left_out([*RUNS[:2], over, RUNS[3]]) == [[0, 1], [3]]
+
+
 def test_who_repeats_a_repeat_repeats_the_first() -> None:
     def families(*told: tuple[str, str | None]) -> list[list[int]]:
         runs = [replace(RUNS[0], id=name, repeat_of=before) for name, before in told]
@@ -44,6 +51,17 @@ def test_who_repeats_a_repeat_repeats_the_first() -> None:
         [0, 1, 2, 4],
         [3],
     ]
+
+
+def test_joints_may_be_called_as_the_torso_turns() -> None:
+    maker = Maker(RobotDescription.load("darwin_leg"))
+    joints = [
+        replace(j, name=n)
+        for j, n in zip(maker.robot.joints, ("pitch", "roll", "a", "b", "c", "d"), strict=False)
+    ]
+    measured = replace(maker.measured, robot=replace(maker.robot, joints=tuple(joints)))
+    told = held_out(measured, maker.model(None, 2.0), maker.model(None, 1.0), 0)
+    assert list(told.per_joint) == [j.name for j in joints] and not told.per_tilt
 
 
 def test_a_motion_done_often_makes_no_interval_narrower() -> None:

@@ -56,6 +56,13 @@ def test_how_a_recording_begins_leaves_out_what_the_whole_does() -> None:
     assert np.array_equal(begun.time, whole.time[whole.time < 1.0])
 
 
+def test_a_blow_between_readings_is_left_out_too() -> None:
+    knee = np.full(200, END - 0.5)
+    knee[100:] = END + 0.05
+    knee[1::2] = np.nan
+    assert knocked(LEG, recording(knee))[100:108].all()
+
+
 def test_who_leans_on_a_stop_or_comes_to_it_slowly_loses_nothing() -> None:
     slow = np.linspace(END - 0.5, END + 0.05, 200)
     assert not knocked(LEG, recording(slow)).any()

@@ -252,18 +252,26 @@ def test_rivals_of_other_classes_are_compared_as_closely_as_the_best(
 
 
 @pytest.mark.parametrize(
-    ("known", "left", "begun"), [(SOFT, 1.05, False), (SOFT, 1.6, True), (FIRST, 1.05, True)]
+    ("known", "left", "begun"),
+    [(SOFT, 1.05, False), (SOFT, 1.6, True), (FIRST, 1.05, True), (None, 0.9, True)],
 )
 def test_no_round_begins_where_the_form_of_what_was_found_may_leave_all_that_is_left(
-    monkeypatch: pytest.MonkeyPatch, known: Hypothesis, left: float, begun: bool
+    monkeypatch: pytest.MonkeyPatch, known: Hypothesis | None, left: float, begun: bool
 ) -> None:
     """A soft floor at another time step leaves a tenth of its trace, in which anything is seen."""
     asked: list[object] = []
     monkeypatch.setattr(selection, "scores", lambda *told: asked.append(told) or [])
     monkeypatch.setattr(selection, "unimitated", nothing)
     monkeypatch.setattr(Made, "_traces", nothing)
+    samples = MAKER.samples
+
+    def off(by: float, *told: Hypothesis) -> Model:
+        model = made((FIRST,), by * samples)
+        fit = replace(model.fit, residual=np.full(samples, np.sqrt(by)))
+        return replace(model, hypotheses=told, fit=fit)
+
     selector = Made({})
-    selector.nominal = made((), 40.0 * MAKER.samples)
-    model = made((FIRST,), left * MAKER.samples)
-    assert selector._round(replace(model, hypotheses=(known,))) is None
+    standing = SimpleNamespace(grounded=np.ones(samples, bool), channel=MAKER.measured.channel)
+    selector.replays, selector.nominal = SimpleNamespace(measured=standing), off(40.0)
+    assert selector._round(off(left, *([known] if known else []))) is None
     assert bool(asked) is begun

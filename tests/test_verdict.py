@@ -146,7 +146,7 @@ def test_what_has_no_name_is_no_surer_than_a_name_that_is_likely(
     """Without its steps a servo's strength is anybody's guess, and all left there no evidence."""
     nameless = found("unknown", 5.0, np.inf, before)
     named = [] if name is None else [found("actuator_lag", 900.0, 1.0, name)]
-    assert beside(nameless, named).probability == after
+    assert beside(nameless, named, BENCH).probability == after
 
 
 def test_what_explains_nearly_all_is_first_whatever_its_size() -> None:
@@ -196,4 +196,4 @@ def test_a_name_is_as_likely_as_its_class(other: str, after: float) -> None:
     """A lag that is told as late commands or as late readings is late, whatever has no name."""
     twin = Alternative(other, Place("joint", BENCH.joint_names[0]), 0.44)
     late = replace(found("command_delay", 900.0, 1.0, 0.47), equivalents=(twin,))
-    assert beside(found("unknown", 5.0, np.inf, 0.65), [late]).probability == after
+    assert beside(found("unknown", 5.0, np.inf, 0.65), [late], BENCH).probability == after

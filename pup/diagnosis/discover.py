@@ -130,14 +130,21 @@ def unexplained(
     )
 
 
-def beside(nameless: Finding, named: Sequence[Finding]) -> Finding:
-    """What has no name beside what has one: no surer than a name whose class is likely.
+def beside(nameless: Finding, named: Sequence[Finding], robot: RobotDescription) -> Finding:
+    """What has no name beside what has one there: no surer than a name whose class is likely.
 
     How much a name leaves on motions that were left out may only say that no other motion tells how
     strong a servo is, or that the effect has a form of its own: of that name it is a part.
     """
-    surest = max((f.probability for f in named if f.of_class >= LIKELY), default=1.0)
+    there = [f for f in named if _meet(f.place, nameless.place, robot)]
+    surest = max((f.probability for f in there if f.of_class >= LIKELY), default=1.0)
     return replace(nameless, probability=min(nameless.probability, surest))
+
+
+def _meet(one: Place, other: Place, robot: RobotDescription) -> bool:
+    """Whether two places have a joint in common, or one of them is not of joints."""
+    first, second = (set(place.joints(robot)) for place in (one, other))
+    return not first or not second or bool(first & second)
 
 
 def _probability(model: Model, selector: Selector) -> float:

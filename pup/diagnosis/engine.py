@@ -208,7 +208,7 @@ def diagnose(
     named = findings(model, rounds, selector, measured, seen) if model.hypotheses else ()
     progress("next recording", 0.95)
     ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
-    nameless = beside(left.finding, named) if left else odd
+    nameless = beside(left.finding, named, robot) if left else odd
     evidence["findings"] = in_order((*named, nameless) if nameless else named)
     return told("mismatch", ask=ask, **evidence)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.fit import Fit
-from pup.diagnosis.fitting import difference, fit_together
+from pup.diagnosis.fitting import complete, difference, fit_together
 from pup.diagnosis.laws import WORDS, contract_name
 from pup.diagnosis.menu import CHANGED, SCRIPTS, Option, options
 from pup.diagnosis.models import Round
@@ -139,6 +139,7 @@ def _refitted(effect: str, place: Place, chosen: Round, selector: Selector) -> F
         fixed = {**before.fixed, **dict(hypothesis.shape)}
         fit = Fit(before.coordinates + free, at, fixed=fixed)
         fit_together([fit], selector.replays, selector.noise, iterations=4)
+        complete([fit], selector.replays, selector.noise)
         return fit
     return None
 

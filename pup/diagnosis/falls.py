@@ -23,14 +23,17 @@ def standing(recording: Recording) -> Recording:
     Args:
       recording: on the ground, or any other.
     """
-    tilts = [t for n in ("imu/roll", "imu/pitch") if (t := recording.extras.get(n)) is not None]
+    told = (recording.extras.get(name) for name in ("imu/roll", "imu/pitch"))
+    tilts = [tilt for tilt in told if tilt is not None and not np.isnan(tilt).all()]
     if recording.support != "ground" or not tilts:
         return recording
-    angles = np.nan_to_num(np.stack(tilts))
-    lean = np.abs(np.arctan2(np.sin(angles), np.cos(angles))).max(axis=0)  # turns aside
+    angles = np.stack(tilts)
+    away = np.abs(np.arctan2(np.sin(angles), np.cos(angles)))  # turns aside
+    lean = away.max(axis=0)  # NaN where one is not told, which is neither upright nor down
     fallen = np.flatnonzero(lean > DOWN)
     upright = np.flatnonzero(lean[: fallen[0]] < TOPPLES) if len(fallen) else fallen
     if not len(upright):
         return recording
-    topples = min(int(upright[-1]) + 1, len(lean) - 1)
+    leaning = np.flatnonzero(lean >= TOPPLES)
+    topples = int(leaning[leaning > upright[-1]][0])
     return beginning(recording, float(recording.time[topples] - recording.time[0]))

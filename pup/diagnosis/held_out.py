@@ -1,6 +1,6 @@
 """Errors on motions that were left out of the fits, before and after."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,11 +62,10 @@ def held_out(measured: Measured, before: Model, after: Model, seed: int) -> Held
         first, second = (float(np.sqrt(np.mean(s[chosen]))) for s in squares)
         return first, second
 
-    per_channel = {
-        name: both(measured.channel == i)
-        for i, name in enumerate((*measured.robot.joint_names, *TILTS))
-        if (measured.channel == i).any()
-    }
+    def of(names: Sequence[str], first: int) -> dict[str, tuple[float, float]]:
+        own = {name: measured.channel == i for i, name in enumerate(names, start=first)}
+        return {name: both(here) for name, here in own.items() if here.any()}
+
     per_motion = {
         motion: both(joints & measured.only(members))
         for motion, members in measured.motions().items()
@@ -77,7 +76,7 @@ def held_out(measured: Measured, before: Model, after: Model, seed: int) -> Held
         tuple(measured.recordings[n].id for n in numbers),
         *both(joints),
         (float(low), float(high)),
-        {name: pair for name, pair in per_channel.items() if name not in TILTS},
+        of(measured.robot.joint_names, 0),
         per_motion,
-        {name: pair for name, pair in per_channel.items() if name in TILTS},
+        of(TILTS, len(measured.robot.joints)),
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pup.physics.model import compile_model
 from pup.physics.terms.scale import Scale
 from pup.recording import Recording
+from pup.recording_cuts import between
 from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
@@ -29,6 +30,7 @@ def knocked(robot: RobotDescription, recording: Recording) -> NDArray[np.bool_]:
     lower, upper = _stops(robot, recording.support)
     columns = [recording.joints.index(name) for name in robot.joint_names]
     position, time = recording.position[:, columns], recording.time
+    position = between(time, position)
     outside = (position < lower - BEYOND * angle) | (position > upper + BEYOND * angle)
     speed = np.abs(np.diff(position, axis=0)) / np.diff(time)[:, None]
     met = np.flatnonzero((outside[1:] & ~outside[:-1] & (speed > FAST * angle)).any(axis=1))

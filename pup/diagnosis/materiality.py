@@ -63,11 +63,17 @@ def little(model: Model, shown: HeldOut) -> str:
 def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
     """By how much errors of joints and tilts on motions left out fall, in their noise."""
     measured = model.measured
-    names = (*measured.robot.joint_names, *TILTS)
+    joints = measured.robot.joint_names
     variance = measured.deviation(noise) ** 2
-    for name, (before, after) in (*shown.per_joint.items(), *shown.per_tilt.items()):
-        own = measured.channel == names.index(name)
-        yield (before - after) / float(np.sqrt(np.mean(variance[own])))
+    for names, told, first in (
+        (joints, shown.per_joint, 0),
+        (TILTS, shown.per_tilt, len(joints)),
+    ):
+        for channel, name in enumerate(names, start=first):
+            if name in told:
+                before, after = told[name]
+                own = measured.channel == channel
+                yield (before - after) / float(np.sqrt(np.mean(variance[own])))
 
 
 def _explained(nominal: Model, model: Model) -> float:

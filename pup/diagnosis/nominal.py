@@ -77,7 +77,8 @@ class Certificate:
         A nominal fit that has lost track of motions stops further off than a better one would: no
         more counts than a certificate allows.
         """
-        return replace(self, left=max(self.left, min(whole.left, SHORT * whole.samples)))
+        left = max(self.left, min(whole.left, SHORT * whole.samples))
+        return replace(self, left=left, samples=whole.samples)
 
     @property
     def made(self) -> bool:
@@ -87,7 +88,7 @@ class Certificate:
     @property
     def holds(self) -> bool:
         """Whether a verdict may be given."""
-        found_again = self.recovered <= SELF or self.left < SHORT * self.samples
+        found_again = self.recovered <= SELF or self.left <= SHORT * self.samples
         return self.agree and found_again
 
 

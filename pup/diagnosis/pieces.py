@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pup.recording import Recording
-from pup.recording_cuts import cut
+from pup.recording_cuts import between, cut
 
 STILL = 0.2
 """At rest, nothing has changed for so long, s."""
@@ -66,11 +66,12 @@ def origins(
 def _wakes(recording: Recording) -> NDArray[np.bool_]:
     """The last tick of each rest."""
     moving = np.zeros(len(recording.time), bool)
+    position = between(recording.time, recording.position)
     small = SMALL * (np.nanmax(recording.target, axis=0) - np.nanmin(recording.target, axis=0))
     read = np.maximum(small, FLICKER * _flicker(recording.position))
     for ago in (STILL, STILL / 2):  # at a turn, values of a while ago are the same again
         before = np.searchsorted(recording.time, recording.time - ago)
-        for values, least in ((recording.target, small), (recording.position, read)):
+        for values, least in ((recording.target, small), (position, read)):
             moving |= (np.abs(values - values[before]) > least).any(axis=1)
     resting = ~moving & (recording.time - recording.time[0] >= STILL)
     return np.asarray(resting & np.append(moving[1:], False))

@@ -188,6 +188,7 @@ class Measured:
         rho = self.memory(noise)
         scaled = errors / self.deviation(noise)
         before = np.concatenate([scaled[..., :1], scaled[..., :-1]], axis=-1)
+        before = np.where(self._follows, before, 0.0)  # another run's may be lost
         return np.asarray((scaled - rho * before) / np.sqrt(1 - rho**2))
 
     def coloured(self, white: Array, noise: Noise) -> Array:

@@ -153,8 +153,9 @@ class Selector:
 
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
-        if spare(fit) < self.blur(model):
-            return None  # all that is left may be the forms of what was found
+        of_contact = any(map(in_contact, model.hypotheses))
+        if of_contact and spare(fit, self.replays.measured.channel) < self.blur(model):
+            return None  # all that is left may be the form of contact that was found
         ranking = scores(self._traces(model), unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
             return None
@@ -231,9 +232,12 @@ class Selector:
 
     def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
-        contact = any(map(in_contact, model.hypotheses))
-        share = max(least, OF_CONTACT) if contact else least
-        return share**2 * max(self.nominal.fit.chi2 - model.fit.chi2, 0.0)
+        before, after = self.nominal.fit.residual, model.fit.residual
+        assert before is not None and after is not None
+        share = np.full(len(after), least)
+        if any(map(in_contact, model.hypotheses)):
+            share[self.replays.measured.grounded] = max(least, OF_CONTACT)
+        return max(float(share**2 @ (before**2 - after**2)), 0.0)
 
     def _refit(self, tried: Sequence[Tried], start: float) -> None:
         """Refit finalists: all for a first look, the promising roughly, the best to the end.

@@ -86,9 +86,8 @@ class Finding:
 
     @property
     def of_class(self) -> float:
-        """Probability of something of its class, whatever its form."""
-        own = CLASS_OF.get(self.effect)
-        alike = (e.probability for e in self.equivalents if CLASS_OF.get(e.effect) == own)
+        """Probability of something of its class at its place, whatever its form."""
+        alike = (e.probability for e in self.equivalents if _cause(e) == _cause(self))
         return self.probability + sum(alike)
 
     @property
@@ -185,7 +184,7 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
     return told
 
 
-def _cause(finding: Finding) -> tuple[object, Place]:
+def _cause(finding: Finding | Alternative) -> tuple[object, Place]:
     return CLASS_OF.get(finding.effect, finding), finding.place
 
 
