@@ -1,7 +1,7 @@
 # Two commands, each doing all of its set-up on a fresh machine:
 #   make run    the main job; RECORDINGS=DIR ROBOT=NAME take your own data, FORMAT=NAME imports it
 #               first (csv, mcap, darwin-hardware, ...), ARGS=... passes options on
-#   make test   linters, types, import floors and the tests
+#   make test   linters, types, import rules and the tests
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin

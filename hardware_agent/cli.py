@@ -14,6 +14,7 @@ from typing import Any
 from hardware_agent.config import Settings
 from hardware_agent.control import Unreachable, say
 from pup.errors import InputError
+from pup.usage import Usage
 
 DONE, FAILED, REFUSED = 0, 1, 2
 PLACE = "/etc/pup-agent/agent.toml"
@@ -39,9 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    whole = argparse.ArgumentParser(
-        prog="pup-agent", description="Runs trials on a robot, and keeps it whole."
-    )
+    whole = Usage(prog="pup-agent", description="Runs trials on a robot, and keeps it whole.")
     place = os.environ.get("PUP_AGENT_CONFIG", PLACE)
     verbs = whole.add_subparsers(required=True, dest="verb", metavar="VERB")
     for name, told in (

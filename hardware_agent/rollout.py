@@ -147,7 +147,7 @@ def recording_id(assign: Assign) -> str:
 
 
 def row_names(joints: Sequence[str]) -> tuple[str, ...]:
-    """What the numbers of a row are, as CONTRACTS.md names columns."""
+    """What the numbers of a row are, as docs/recordings.md names columns."""
     per_joint = [f"{kind}/{joint}" for kind in KINDS for joint in joints]
     return ("time", *per_joint, "voltage", *IMU_COLUMNS, "torque_enabled")
 
@@ -155,7 +155,7 @@ def row_names(joints: Sequence[str]) -> tuple[str, ...]:
 def recording_of(
     assign: Assign, rows: Array, joints: Sequence[str], robot: str, source: str, notes: str
 ) -> Recording:
-    """What a rollout did, by CONTRACTS.md.
+    """What a rollout did, by docs/recordings.md.
 
     Args:
       assign: the trial.

@@ -5,6 +5,7 @@ import re
 from importlib.metadata import version
 from pathlib import Path
 
+from pup.usage import Usage
 from services.arguments_experiment import experiment
 from services.arguments_jobs import jobs, submit
 from services.arguments_policies import replay, serve, train, transfer, virtual_robot
@@ -16,7 +17,7 @@ NEGATIVE = re.compile(r"-[\d.][\d.eE+,-]*$")
 
 
 def parser(
-    kind: type[argparse.ArgumentParser] = argparse.ArgumentParser,
+    kind: type[argparse.ArgumentParser] = Usage,
 ) -> argparse.ArgumentParser:
     """The whole command line, as a kind of parser; the verb ends up in `name`."""
     whole = kind(

@@ -15,7 +15,7 @@ from pup.robot import RobotDescription
 from services.diagnosis import CORRECTED, DIAGNOSIS
 
 LAW = "pd"
-"""Torque law of the nominal model (CONTRACTS.md, section 2)."""
+"""Torque law of the nominal model (docs/physics.md)."""
 
 
 def replayed(diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:

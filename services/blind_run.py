@@ -16,7 +16,7 @@ from pup.recording import Recording, load_recordings
 from pup.robot import RobotDescription, built_in_robots
 from services.blind_journal import JOURNAL, Journal
 from services.diagnosis import DIAGNOSIS, alone, run_diagnosis
-from services.failures import ERROR, caught, lost, mended, named
+from services.failures import ERROR, FailedError, caught, lost, mended, named
 from services.places import Pools
 
 SEED = 0
@@ -52,11 +52,12 @@ class Order:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case: the verdict and how long it took, or what went wrong."""
+    """What became of a case: the verdict and how long it took, or what went wrong, and by whom."""
 
     verdict: str = ""
     seconds: float = 0.0
     error: str = ""
+    mistaken: bool = False
 
 
 def orders(folder: Path, out: Path, limit: int | None) -> tuple[list[Order], dict[str, Any]]:
@@ -102,11 +103,13 @@ def run_cases(
       tell: told how many are done.
 
     Raises:
-      InputError: some cases failed.
+      InputError: some cases failed, all of them by bad input.
+      FailedError: some failed otherwise.
     """
     # The longest first, so that none is left for the end.
     todo = sorted((o for o in wanted if not o.done), key=lambda o: (-o.weight, o.name))
     failed: dict[str, str] = {}
+    mistaken: set[str] = set()
     done, share = len(wanted) - len(todo), 0.0
     whole = sum(order.weight for order in todo)
     with journal.session(lanes, failed), closing(pools(diagnose_case)) as pool:
@@ -118,13 +121,15 @@ def run_cases(
             told = _settled(order, outcome)
             if told.error:
                 failed[order.name] = told.error
+                mistaken |= {order.name} if told.mistaken else set()
             else:
                 journal.seal(order.name)
             done += not told.error
             share += order.weight / max(whole, 1)
             tell(done, len(wanted), _note(order, told, failed), share)
     if failed:
-        raise InputError(_complaint(failed, len(wanted), journal.folder))
+        kind = InputError if mistaken == set(failed) else FailedError
+        raise kind(_complaint(failed, len(wanted), journal.folder))
 
 
 def diagnose_case(order: Order) -> Outcome:
@@ -135,7 +140,7 @@ def diagnose_case(order: Order) -> Outcome:
             robot, recordings, order.out, alone(1), lambda stage, share: None, SEED, report=False
         )
     except Exception as error:  # whatever it is, the other cases go on
-        return Outcome(error=caught(order.out, error))
+        return Outcome(error=caught(order.out, error), mistaken=isinstance(error, InputError))
     mended(order.out)
     return Outcome(told["verdict"], told["seconds"])
 

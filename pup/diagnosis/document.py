@@ -1,4 +1,4 @@
-"""`diagnosis.json` (CONTRACTS.md, section 5)."""
+"""`diagnosis.json` (docs/diagnosis.md)."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -115,7 +115,7 @@ def diagnose(
     """Locate and name what the simulator of a robot leaves out.
 
     Args:
-      robot: the robot, with the nominal actuator of CONTRACTS.md, section 2.
+      robot: the robot, with the nominal actuator of docs/physics.md.
       recordings: of that robot; one alone is taken in parts, where it comes to rest between them.
       runner: makes what runs batches of replays.
       lanes: how many run at once.

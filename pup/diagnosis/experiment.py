@@ -92,7 +92,7 @@ class NextRecording:
     splits: tuple[Pair, ...]
 
     def document(self) -> dict[str, Any]:
-        """As in CONTRACTS.md, section 5."""
+        """As in docs/diagnosis.md."""
         named = [(contract_name(pair.first), contract_name(pair.second)) for pair in self.splits]
         pairs = dict.fromkeys(named)
         return {

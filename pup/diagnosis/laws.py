@@ -88,5 +88,5 @@ WORDS = {
 
 
 def contract_name(effect: str) -> str:
-    """An effect as CONTRACTS.md, section 6, names it; what that does not list has no name."""
+    """An effect as docs/physics.md names it; what that does not list has no name."""
     return NAMELESS if effect in UNLISTED else FORMS.get(effect, effect)

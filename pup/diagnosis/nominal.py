@@ -108,7 +108,7 @@ class Nominal:
 
 
 def free_names(space: ParameterSpace, ground: bool) -> tuple[str, ...]:
-    """What the nominal fit may move (CONTRACTS.md, section 2)."""
+    """What the nominal fit may move (docs/diagnosis.md)."""
     return tuple(
         name
         for name in space.names

@@ -68,7 +68,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Finding:
-    """One effect that the nominal model leaves out; fields as in CONTRACTS.md, section 5."""
+    """One effect that the nominal model leaves out; fields as in docs/diagnosis.md."""
 
     effect: str
     place: Place

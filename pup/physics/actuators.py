@@ -53,7 +53,7 @@ class TorqueLaw(Protocol):
 
 
 class PD:
-    """Torque clip(kp (target - q) - kd qdot, ±tau_max), per joint group (CONTRACTS.md, section 2).
+    """Torque clip(kp (target - q) - kd qdot, ±tau_max), per joint group (docs/physics.md).
 
     Args:
       robot: gives the groups of the joints.

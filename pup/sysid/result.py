@@ -1,4 +1,4 @@
-"""The outcome of pre-sysID and its file, `bounds.json` (CONTRACTS.md, section 4)."""
+"""The outcome of pre-sysID and its file, `bounds.json` (docs/presysid.md)."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -202,7 +202,8 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: not a bounds file ({type(error).__name__}: {error})") from error
+        told = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{path}: not a bounds file of pup presysid: {told}") from error
     try:
         space = robot_space(robot, kind)
     except InputError as error:

@@ -16,7 +16,7 @@ CONCEALED = {
     "body": ("bias", "inertia"),
     "sensor": ("imu",),
 }
-"""Classes of effects (CONTRACTS.md, section 6) that every virtual robot has, by its parts."""
+"""Classes of effects (docs/physics.md) that every virtual robot has, by its parts."""
 
 
 def diagnoses(plan: Plan, cells: Container[str], found: Mapping[str, Any]) -> dict[str, Any]:

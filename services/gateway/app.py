@@ -1,4 +1,4 @@
-"""The REST interface of CONTRACTS.md section 7, and what hangs together with it."""
+"""The REST interface of docs/gateway.md, and what hangs together with it."""
 
 import time
 from dataclasses import fields

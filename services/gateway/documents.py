@@ -1,4 +1,4 @@
-"""What pages read of the documents that jobs write (CONTRACTS.md, sections 4 and 5)."""
+"""What pages read of the documents that jobs write (docs/presysid.md and docs/diagnosis.md)."""
 
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal

@@ -1,4 +1,4 @@
-"""The physics library: every effect of CONTRACTS.md, section 6, and more; how columns name them.
+"""The physics library: every effect of docs/physics.md; how columns name them.
 
 A column `effect/quantity@place` of a parameter space puts a term into a simulation, with no other
 word anywhere: a space without such columns is the nominal model.
@@ -149,7 +149,7 @@ class Place:
     """Where a term acts.
 
     Attributes:
-      kind: of CONTRACTS.md, section 5.
+      kind: of docs/diagnosis.md.
       name: of the joint, group, body or foot; empty for the kinds there is one of.
     """
 

@@ -175,7 +175,7 @@ class Term:
     """An omitted effect, bound to the simulations of one batch.
 
     Attributes:
-      effect: its name, of CONTRACTS.md, section 6.
+      effect: its name, of docs/physics.md.
       kinds: places it can act at.
       quantities: its parameters, magnitudes first.
       source: where the typical sizes come from.
