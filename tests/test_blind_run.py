@@ -19,6 +19,7 @@ from pup.files import read_json, write_json
 from services import blind_run
 from services.blind_journal import Journal
 from services.blind_run import Order, diagnose_case, orders, run_cases
+from services.failures import FailedError
 from services.places import OneByOne
 from workers.cases import RayPool
 from workers.cluster import connected
@@ -243,7 +244,9 @@ def test_a_case_whose_process_is_lost_is_recorded(quick: Path) -> None:
         def settled(self) -> tuple[Any, Any]:
             return self.waiting.popleft(), RuntimeError("The worker died.\nIt left nothing.")
 
-    with pytest.raises(ValueError, match=r"3 of 3 cases failed.*case_a \(RuntimeError: The worker"):
+    with pytest.raises(
+        FailedError, match=r"3 of 3 cases failed.*case_a \(RuntimeError: The worker"
+    ):
         run_cases(found, Journal(out, commitment), Lost, 1, lambda *_: None)
     error = read_json(out / "case_b" / "error.json")
     assert error["details"] == ["The worker died.", "It left nothing."]
