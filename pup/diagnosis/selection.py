@@ -56,9 +56,10 @@ PLACES = 16
 """Places that all effects together may act at."""
 KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""
-FORM, OF_CONTACT = 0.03, 0.1
+FORM, OF_CONTACT = 0.03, 0.25
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
-is no evidence of another. One of contact, even of the same law, is by more at another time step."""
+is no evidence of another. Of contact a solver of another kind leaves a fifth, even the same law at
+another time step a tenth (docs/results/diagnosis.md)."""
 
 
 class Selector:
