@@ -244,9 +244,7 @@ def test_a_case_whose_process_is_lost_is_recorded(quick: Path) -> None:
         def settled(self) -> tuple[Any, Any]:
             return self.waiting.popleft(), RuntimeError("The worker died.\nIt left nothing.")
 
-    with pytest.raises(
-        FailedError, match=r"3 of 3 cases failed.*case_a \(RuntimeError: The"
-    ):
+    with pytest.raises(FailedError, match=r"3 of 3 cases failed.*case_a \(RuntimeError: The"):
         run_cases(found, Journal(out, commitment), Lost, 1, lambda *_: None)
     error = read_json(out / "case_b" / "error.json")
     assert error["details"] == ["The worker died.", "It left nothing."]

@@ -275,3 +275,18 @@ def test_no_round_begins_where_the_form_of_what_was_found_may_leave_all_that_is_
     selector.replays, selector.nominal = SimpleNamespace(measured=standing), off(40.0)
     assert selector._round(off(left, *([known] if known else []))) is None
     assert bool(asked) is begun
+
+
+@pytest.mark.parametrize("followed", [False, True])
+def test_a_motion_that_is_lost_hides_nothing_in_others(followed: bool) -> None:
+    """Half a radian off, even a form's small share of it is more than a second effect explains."""
+    lost = np.arange(MAKER.samples) < MAKER.samples // 10
+
+    def off(there: float, elsewhere: float) -> Model:
+        model = made((FIRST,), 1.0)
+        return replace(model, fit=replace(model.fit, residual=np.where(lost, there, elsewhere)))
+
+    selector = Made({})
+    selector.nominal, selector.followed = off(250.0, 3.0), ~lost if followed else None
+    assert selector._beyond_forms(off(5.0, 1.2), off(5.0, 1.0)) is followed
+    assert not selector._beyond_forms(off(5.0, 1.2), off(4.9, 1.2))

@@ -89,7 +89,8 @@ def search(
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
     told = _teller(progress)
-    selector = Exchanger(replays, nominal.noise, found, enough, nominal.fit, base, most, told)
+    near = None if first is None else _looked_at(first, replays.measured)
+    selector = Exchanger(replays, nominal.noise, found, enough, nominal.fit, base, most, told, near)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
     start = selector.nominal
@@ -134,7 +135,10 @@ def search_on(
     latest = [*turned.traces(others, fit), *(t for t in found if t.hypothesis.key in own)]
     around = fit if near else base
     told = _teller(progress)
-    selector = Exchanger(replays, nominal.noise, latest, enough, nominal.fit, around, most, told)
+    followed = done.selector.followed
+    selector = Exchanger(
+        replays, nominal.noise, latest, enough, nominal.fit, around, most, told, followed
+    )
     start = selector.model(known, fit) if known else selector.nominal
     models = {done.selector.nominal: selector.nominal, done.model: start}
     rounds = turned.rounds(done.rounds, models, selector)
@@ -197,9 +201,7 @@ def extended(known: Fit, whole: Fit) -> Fit:
 
 def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
     """Traces of a first look, as if the motions that it left out showed nothing."""
-    measured = replays.measured
-    looked = {recording.id for recording in first.selector.replays.measured.recordings}
-    inside = measured.only([i for i, r in enumerate(measured.recordings) if r.id in looked])
+    inside = _looked_at(first, replays.measured)
     project = Projector(base.slopes)
 
     def widened(trace: Trace) -> Trace | None:
@@ -208,6 +210,12 @@ def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
         return traced(trace.hypothesis, whole, project)
 
     return [trace for trace in map(widened, first.found) if trace is not None]
+
+
+def _looked_at(first: Search, measured: Measured) -> NDArray[np.bool_]:
+    """The samples of the recordings of a first look."""
+    looked = {recording.id for recording in first.selector.replays.measured.recordings}
+    return measured.only([i for i, r in enumerate(measured.recordings) if r.id in looked])
 
 
 def followed(nominal: Nominal, replays: Replays) -> list[int]:

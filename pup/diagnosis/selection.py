@@ -74,6 +74,7 @@ class Selector:
       base: the fit to start from, where some effects are known already.
       most: effects that are looked for.
       told: of each effect that is added.
+      followed: the samples that the nominal fit keeps track of; None for all.
     """
 
     def __init__(
@@ -86,11 +87,13 @@ class Selector:
         base: Fit | None = None,
         most: int = 8,
         told: Callable[[Model], None] = lambda model: None,
+        followed: NDArray[np.bool_] | None = None,
     ) -> None:
         self.replays = replays
         self.noise = noise
         self.found, self.base = tuple(found), base or nominal
         self.enough, self.most, self.told = enough, most, told
+        self.followed = followed
         self.folds = folds(replays)
         self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
         self._lesser: tuple[Model | None, list[Fit]] = None, []
@@ -233,12 +236,29 @@ class Selector:
 
     def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
-        before, after = self.nominal.fit.residual, model.fit.residual
-        assert before is not None and after is not None
-        share = np.full(len(after), least)
+        return max(float(self._forms(model, least).sum()), 0.0)
+
+    def _forms(self, model: Model, least: float) -> Array:
+        """The same of each sample, shape (n_samples,)."""
+        gained = _gained(self.nominal.fit, model.fit)
+        share = np.full(len(gained), least)
         if any(map(in_contact, model.hypotheses)):
             share[self.replays.measured.grounded] = max(least, OF_CONTACT)
-        return max(float(share**2 @ (before**2 - after**2)), 0.0)
+        return np.asarray(share**2 * gained)
+
+    def _beyond_forms(self, before: Model, after: Model) -> bool:
+        """Whether an effect explains more than wrong forms of those before it may leave.
+
+        Of all motions, or of those that the nominal model follows: one that it loses track of is so
+        far off that a form's share of it would hide whatever else there is.
+        """
+        inside, allowed = _gained(before.fit, after.fit), self._forms(before, FORM)
+        if inside.sum() > max(allowed.sum(), 0.0):
+            return True
+        if self.followed is None:
+            return False
+        near, nearby = inside[self.followed].sum(), allowed[self.followed].sum()
+        return bool(near > max(nearby, self.enough))
 
     def _refit(self, tried: Sequence[Tried], start: float) -> None:
         """Refit finalists: all for a first look, the promising roughly, the best to the end.
@@ -282,7 +302,7 @@ class Selector:
         outside = float((before.held_out - after.held_out).sum())
         if outside <= max(KEPT * inside, 0.5 * self.enough):
             return False
-        if inside <= self.blur(before):
+        if not self._beyond_forms(before, after):
             return False
         newest, known = after.hypotheses[-1], _effects(before.hypotheses)
         both, measured = (before.fit, after.fit), self.replays.measured
@@ -341,6 +361,12 @@ class Selector:
 def full(model: Model, most: int) -> bool:
     """Whether a model has as many effects as are looked for, or at as many places as can be."""
     return len(model.hypotheses) >= PLACES or len(_effects(model.hypotheses)) >= most
+
+
+def _gained(before: Fit, after: Fit) -> Array:
+    """By how much each sample costs less, shape (n_samples,)."""
+    assert before.residual is not None and after.residual is not None
+    return np.asarray(before.residual**2 - after.residual**2)
 
 
 def _effects(hypotheses: Sequence[Hypothesis]) -> set[str]:
