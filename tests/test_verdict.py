@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.discover import beside
 from pup.diagnosis.doubts import doubt, left_outside, left_over
 from pup.diagnosis.evidence import Score, Trace
@@ -104,6 +105,23 @@ def test_siblings_that_fit_alike_are_alike_likely() -> None:
     noise, before = Noise(np.full(3, 0.002), np.zeros(3), "repeats"), left(MEASURED, 20.0)
     late, old = rival("command_delay", 1.0), rival("measurement_delay", 1.0)
     assert probabilities([late, old], before, noise) == pytest.approx([0.5, 0.5])
+
+
+def test_of_what_fits_alike_the_more_usual_size_is_likelier() -> None:
+    """An encoder that is off by a tenth of a radian is rarer than a load that hangs askew."""
+    noise, before = Noise(np.full(3, 0.002), np.zeros(3), "repeats"), left(MEASURED, 20.0)
+
+    def sized(effect: str, size: float) -> Model:
+        model = rival(effect, 1.0)
+        (known,) = model.hypotheses
+        free = tuple(term_coordinate(name, known.scale) for name in known.magnitudes[:1])
+        return replace(model, fit=replace(model.fit, coordinates=free, at=np.array([size])))
+
+    load, encoder = sized("com_offset", 0.8), sized("encoder_bias", 6.0)
+    assert load.worth < encoder.worth < sized("encoder_bias", 7.0).worth
+    likely, rare = probabilities([load, encoder], before, noise)
+    assert likely > 2 * rare > 0.1
+    assert probabilities([load, sized("encoder_bias", 1.5)], before, noise)[1] > 0.45
 
 
 def test_noise_that_is_not_well_known_is_no_reason_to_doubt() -> None:

@@ -14,6 +14,11 @@ from pup.physics.terms import Place
 
 Array = NDArray[np.float64]
 
+TEMPERATURE = 4.0
+"""Differences of worth are divided by this: models of real data are never quite right."""
+USUAL = 3.0
+"""Effects of more than so many times their typical size are rare."""
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -49,9 +54,19 @@ class Model:
 
     @property
     def worth(self) -> float:
-        """What it explains: half its chi-squared in sample, half out of it, and its complexity."""
+        """What it costs: half its chi-squared in sample, half out of it, and its complexity.
+
+        And how unusual its sizes are: an encoder that is off by a tenth of a radian is rarer than a
+        load whose centre is off by a centimetre, which moves a servo in the same way.
+        """
         inside = self.fit.chi2 + self.freedom * float(np.log(self.samples))
-        return (inside + float(self.held_out.sum())) / 2
+        return (inside + float(self.held_out.sum())) / 2 + 2 * TEMPERATURE * self._strange()
+
+    def _strange(self) -> float:
+        """How unusual its effects' sizes are: minus the logarithm of how often they are seen."""
+        own = {name for hypothesis in self.hypotheses for name in hypothesis.magnitudes}
+        free = np.array([name in own for name in self.fit.names], dtype=bool)
+        return float(np.log1p((self.fit.at[free] / USUAL) ** 4).sum())
 
 
 @dataclass(frozen=True, eq=False)

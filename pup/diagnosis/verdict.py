@@ -14,7 +14,7 @@ from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.laws import EQUATIONS
 from pup.diagnosis.locate import BAND
-from pup.diagnosis.models import Model, Round, chosen_in
+from pup.diagnosis.models import TEMPERATURE, Model, Round, chosen_in
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.selection import Selector
@@ -23,8 +23,6 @@ from pup.physics.terms import CLASS_OF, TERMS, Place, Quantity, split_column
 Array = NDArray[np.float64]
 Answer = Literal["mismatch", "none", "undetermined"]
 
-TEMPERATURE = 4.0
-"""Differences of worth are divided by this: models of real data are never quite right."""
 BLUR = 0.5
 """Difference of worth, in what is left, at which rivals count as equals but for a factor of e."""
 OWN_FORM, FORM = 0.2, 0.03
