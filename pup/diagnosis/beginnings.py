@@ -81,15 +81,3 @@ def noise_like(fit: Fit) -> bool:
     """Whether a fit leaves no more than noise: then it has not stopped short by much."""
     assert fit.residual is not None
     return fit.chi2 <= (1 + SPARE) * len(fit.residual)
-
-
-def spare(fit: Fit, channel: NDArray[np.int64]) -> float:
-    """Chi-squared that anything more could still lower: what a fit to the noise leaves stays.
-
-    Args:
-      fit: with its residual.
-      channel: of each sample; noise may be told too large at one and too small at another.
-    """
-    assert fit.residual is not None
-    beyond = np.bincount(channel, fit.residual**2 - (1 - SPARE))
-    return float(np.maximum(beyond, 0.0).sum())

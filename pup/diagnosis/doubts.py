@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.beginnings import SPARE
 from pup.diagnosis.jitter import jitter
 from pup.diagnosis.models import Model
 from pup.diagnosis.residuals import Noise
@@ -30,7 +31,7 @@ def doubt(explained: float, left: float) -> float:
 
 def left_over(model: Model, noise: Noise) -> float:
     """Chi-squared that a model leaves beyond noise, however large that may be at each channel."""
-    return _beyond(model, unexplained_errors(model), noise)
+    return _beyond(model, unexplained_errors(model), _usual(noise))
 
 
 def left_outside(model: Model, noise: Noise) -> float:
@@ -42,8 +43,15 @@ def left_outside(model: Model, noise: Noise) -> float:
     assert model.fit.residual is not None
     measured = model.measured
     errors = measured.whiten((measured.values - model.predicted)[None], noise)[0]
-    lost = _beyond(model, errors, noise) - _beyond(model, model.fit.residual, noise)
+    usual = _usual(noise)
+    lost = _beyond(model, errors, usual) - _beyond(model, model.fit.residual, usual)
     return left_over(model, noise) + max(lost, 0.0)
+
+
+def spare(model: Model) -> float:
+    """Chi-squared that anything more could still lower: what a fit to the noise leaves stays."""
+    assert model.fit.residual is not None
+    return _beyond(model, model.fit.residual, 1 - SPARE)
 
 
 def unexplained_errors(model: Model) -> Array:
@@ -53,8 +61,11 @@ def unexplained_errors(model: Model) -> Array:
     return model.fit.residual if uneven is None else uneven.residual
 
 
-def _beyond(model: Model, errors: Array, noise: Noise) -> float:
-    """The part of some whitened errors' squares that is more than noise, over all channels."""
-    usual = 1 + SURE * noise.unsure
+def _usual(noise: Noise) -> float:
+    return 1 + SURE * noise.unsure
+
+
+def _beyond(model: Model, errors: Array, usual: float) -> float:
+    """The part of some whitened errors' squares that is more than usual, over all channels."""
     beyond = np.bincount(model.measured.channel, errors**2 - usual)
     return float(np.maximum(beyond, 0.0).sum())

@@ -104,8 +104,7 @@ class Fit:
 
     def covariance(self) -> Array:
         """Of the coordinates, shape (n_free, n_free); what the data do not see has its range."""
-        assert self.jacobian is not None
-        weighted = self.jacobian if self.weight is None else self.jacobian * self.weight[:, None]
+        weighted = self._weighted()
         span = np.array([c.upper - c.lower for c in self.coordinates])
         return np.asarray(np.linalg.inv(weighted.T @ weighted + np.diag(12 / span**2)))
 
@@ -118,12 +117,15 @@ class Fit:
 
     def normal(self) -> Array:
         """Half of chi-squared's second derivatives, as the Jacobian has them, (n_free, n_free)."""
-        assert self.jacobian is not None
-        weighted = self.jacobian if self.weight is None else self.jacobian * self.weight[:, None]
+        weighted = self._weighted()
         normal = weighted.T @ weighted
         if self.belief:
             normal[np.diag_indices_from(normal)] += self.belief.precision
         return np.asarray(normal)
+
+    def _weighted(self) -> Array:
+        assert self.jacobian is not None
+        return self.jacobian if self.weight is None else self.jacobian * self.weight[:, None]
 
     def promise(self, to: Array) -> float:
         """Gain of chi-squared at a point, as the Jacobian has it."""

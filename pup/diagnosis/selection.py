@@ -12,7 +12,8 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.beginnings import nearer, spare
+from pup.diagnosis.beginnings import nearer
+from pup.diagnosis.doubts import spare
 from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import complete, fit_together, start_best
@@ -158,7 +159,7 @@ class Selector:
     def _round(self, model: Model) -> Round | None:
         fit = model.fit
         of_contact = any(map(in_contact, model.hypotheses))
-        if of_contact and spare(fit, self.replays.measured.channel) < self.blur(model):
+        if of_contact and spare(model) < self.blur(model):
             return None  # all that is left may be the form of contact that was found
         ranking = scores(self._traces(model), unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
