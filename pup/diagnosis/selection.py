@@ -59,8 +59,8 @@ KEPT = 0.25
 """Share of its gain that an effect must keep on motions left out."""
 FORM, OF_CONTACT = 0.03, 0.25
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
-is no evidence of another. Of contact a solver of another kind leaves a fifth, even the same law at
-another time step a tenth (docs/results/diagnosis.md)."""
+is no evidence of another. Of contact another impedance and integrator leave a fifth, even the same
+law at another time step a tenth (docs/results/diagnosis.md)."""
 
 
 class Selector:
