@@ -109,7 +109,7 @@ def run_cases(
     # The longest first, so that none is left for the end.
     todo = sorted((o for o in wanted if not o.done), key=lambda o: (-o.weight, o.name))
     failed: dict[str, str] = {}
-    mistaken: set[str] = set()
+    mistaken = True
     done, share = len(wanted) - len(todo), 0.0
     whole = sum(order.weight for order in todo)
     with journal.session(lanes, failed), closing(pools(diagnose_case)) as pool:
@@ -121,14 +121,14 @@ def run_cases(
             told = _settled(order, outcome)
             if told.error:
                 failed[order.name] = told.error
-                mistaken |= {order.name} if told.mistaken else set()
+                mistaken = mistaken and told.mistaken
             else:
                 journal.seal(order.name)
             done += not told.error
             share += order.weight / max(whole, 1)
             tell(done, len(wanted), _note(order, told, failed), share)
     if failed:
-        kind = InputError if mistaken == set(failed) else FailedError
+        kind = InputError if mistaken else FailedError
         raise kind(_complaint(failed, len(wanted), journal.folder))
 
 

@@ -1,6 +1,6 @@
 """Leaving out: what is left out together, and what it costs by a fit to the rest."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,27 +19,27 @@ NOMINAL, TYPICAL = 0.2, 0.5
 
 def folds(replays: Replays) -> list[list[int]]:
     """What is left out together: types of motion, or where there is one, motions."""
-    types = _told(replays.measured, replays.measured.motions())
+    types = _told(replays.measured, replays.measured.motions().values())
     return types if len(types) > 1 else apart(replays.measured)
 
 
 def fold_words(measured: Measured) -> str:
     """What `folds` leaves out at a time, in words."""
-    if len(_told(measured, measured.motions())) > 1:
+    if len(_told(measured, measured.motions().values())) > 1:
         return "type of motion"
-    return "motion" if len(_told(measured, measured.families())) > 1 else "recording"
+    return "motion" if len(_told(measured, measured.families().values())) > 1 else "recording"
 
 
 def apart(measured: Measured) -> list[list[int]]:
     """Recordings by motion, as one done again tells little new; each alone where all are one."""
-    families = _told(measured, measured.families())
-    alone = {str(i): [i] for i in range(len(measured.recordings))}
+    families = _told(measured, measured.families().values())
+    alone = ([i] for i in range(len(measured.recordings)))
     return families if len(families) > 1 else _told(measured, alone)
 
 
-def _told(measured: Measured, recordings: Mapping[str, list[int]]) -> list[list[int]]:
-    """Those of which any sample is left."""
-    return [members for members in recordings.values() if measured.only(members).any()]
+def _told(measured: Measured, sets: Iterable[list[int]]) -> list[list[int]]:
+    """Those sets of recordings of which any sample is left."""
+    return [members for members in sets if measured.only(members).any()]
 
 
 def left_out(fit: Fit, inside: NDArray[np.bool_]) -> float:

@@ -65,15 +65,11 @@ def _gains(model: Model, shown: HeldOut, noise: Noise) -> Iterator[float]:
     measured = model.measured
     joints = measured.robot.joint_names
     variance = measured.deviation(noise) ** 2
-    for names, told, first in (
-        (joints, shown.per_joint, 0),
-        (TILTS, shown.per_tilt, len(joints)),
-    ):
-        for channel, name in enumerate(names, start=first):
-            if name in told:
-                before, after = told[name]
-                own = measured.channel == channel
-                yield (before - after) / float(np.sqrt(np.mean(variance[own])))
+    errors = {joints.index(name): pair for name, pair in shown.per_joint.items()}
+    errors |= {len(joints) + TILTS.index(name): pair for name, pair in shown.per_tilt.items()}
+    for channel, (before, after) in errors.items():
+        own = measured.channel == channel
+        yield (before - after) / float(np.sqrt(np.mean(variance[own])))
 
 
 def _explained(nominal: Model, model: Model) -> float:
