@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.fitting import _jacobian
-from pup.diagnosis.replays import Batch, Bench, Replays, threads, union
+from pup.diagnosis.replays import BATCH, Batch, Bench, Replays, threads, union
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.store import Store
 from pup.physics.parameters import robot_space
@@ -90,3 +90,23 @@ def test_samples_that_are_lost_say_nothing_and_others_do(measured: Measured) -> 
     jacobian = _jacobian(np.array([0.5]), changed, bench(measured), noise)
     assert not jacobian[measured.only([0])].any()
     assert (jacobian[~measured.only([0])] == 2.0 / 0.002).all()
+
+
+def test_all_lanes_have_as_many_batches(measured: Measured) -> None:
+    """Of three, one of two lanes would do two."""
+    count = 2 * (BATCH // len(measured.recordings)) + 1
+    rows = [{"kp/servo": 8.0 + i / count} for i in range(count)]
+
+    def sizes(lanes: int) -> list[int]:
+        asked: list[Batch] = []
+
+        def run(batches: list[Batch]) -> list[np.ndarray]:
+            asked.extend(batches)
+            return [np.zeros((len(b.rows), len(measured.values))) for b in batches]
+
+        Replays(measured, robot_space(BENCH, "pd"), run, lanes)(rows)
+        return [len(batch.rows) for batch in asked]
+
+    assert [len(sizes(lanes)) for lanes in (1, 2, 3)] == [3, 4, 3]
+    assert max(sizes(2)) - min(sizes(2)) <= 1
+    assert sum(sizes(2)) == count

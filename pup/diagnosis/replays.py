@@ -206,6 +206,8 @@ class Replays:
         most = max(1, BATCH // len(recordings))
         worth = max(1, len(rows) * len(recordings) // WORTH)
         parts = max(min(self.lanes, worth), -(-len(rows) // most))
+        if parts > self.lanes:
+            parts += -parts % self.lanes  # three batches on two lanes take as long as four
         return [
             Batch(
                 part,
