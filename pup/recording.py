@@ -104,6 +104,16 @@ class Recording:
             if values.shape != rows:
                 raise InputError(f"column {name!r} has shape {values.shape}, time has {rows}")
 
+    def _check_first_targets(self) -> None:
+        """Refuse what no replay can begin with: what held a joint until its first command."""
+        for name, told in zip(self.joints, ~np.isnan(self.target.T), strict=True):
+            if not told[0]:
+                row = int(np.argmax(told))
+                raise InputError(
+                    f"column 'target/{name}' has no value before row {row}, so nobody knows what "
+                    f"held the joint until then; leave the rows before {row} out"
+                )
+
     def columns(self) -> Iterator[tuple[str, Array]]:
         """The columns of the file in order: time, targets, positions, the rest."""
         yield "time", self.time
@@ -136,7 +146,7 @@ class Recording:
         return digest.hexdigest()
 
     def validate(self, robot: RobotDescription) -> None:
-        """Check that the recording is of this robot: its joints, name, base, knobs and units.
+        """Check that it can be replayed with this robot: joints, name, base, knobs and units.
 
         Raises:
           InputError: one of them does not fit.
@@ -163,6 +173,7 @@ class Recording:
                 f"{robot.name!r} is {base} in model.xml; should the support be {right!r}?"
             )
         try:
+            self._check_first_targets()
             robot.setup(self.setup)
             check_units(robot.joints, dict(self.columns()))
         except InputError as error:

@@ -135,7 +135,7 @@ def test_parameters_are_mirrored_with_the_joints_that_they_are_of() -> None:
         *("rho/knee", "torque_limit", "torso_com/x", "torso_com/z", "ground_friction"),
         *("coulomb_friction/torque@group:ankle", "command_delay/time@bus", "imu_delay/time@sensor"),
         *("ground_slope/pitch@ground", "payload/mass@body:body", "clock_skew/share@robot"),
-        "backlash/gap@joint:head_pan",
+        *("backlash/gap@joint:head_pan", "mass/body", "com/body/x"),
     )
     names = (*knees, *alone)
     mirror = MirrorMap.of(ROBOT, OBSERVATION, names)
@@ -146,6 +146,7 @@ def test_parameters_are_mirrored_with_the_joints_that_they_are_of() -> None:
         *("backlash/gap@joint:l_ank_roll", "payload/mass@body:l_knee_link"),
         *("imu_misalignment/yaw@sensor", "encoder_bias/offset@joint:head_pan"),
         *("ground_compliance/time@foot:l_ank_roll_link", "cogging/sine@group:knee"),
+        *("mass/l_knee_link", "com/l_knee_link/x", "com/l_knee_link/y", "com/body/y"),
     )
     assert unmirrored(ROBOT, (*names, *lateral)) == lateral
     assert unmirrored(ROBOT, knees[:1]) == knees[:1]

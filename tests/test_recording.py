@@ -186,6 +186,9 @@ def test_validate_wants_exactly_the_robots_joints_and_knobs() -> None:
         dataclasses.replace(fitting, setup={"colour": 1.0}).validate(robot)
     with pytest.raises(InputError, match="'r1' is of robot 'arm', not of 'servo_bench'"):
         dataclasses.replace(fitting, robot="arm").validate(robot)
+    late = dataclasses.replace(fitting, target=[[np.nan], [np.nan], [1.0]])
+    with pytest.raises(InputError, match="'target/servo' has no value before row 2"):
+        late.validate(robot)
 
 
 def test_validate_refuses_other_units_and_lets_a_robot_fall() -> None:

@@ -1,6 +1,7 @@
 """Replays against closed forms, and what must not depend on how they are put together."""
 
 import ctypes
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,14 @@ Array = NDArray[np.float64]
 G = 9.81
 STEP = 0.002  # s, the sub-step of the robots used here but `emps`
 MASS, LENGTH = 0.3247, 0.1  # of the servo bench at its knobs' defaults
+FACTOR = """
+[[parameter]]
+name = "mass/load"
+unit = "1"
+nominal = 1.0
+search = [0.5, 2.0]
+actuators = ["pd"]
+"""
 ARM = 1e-6 + 1e-7  # kg m², its arm and the load's own
 BENCH = RobotDescription.load("servo_bench")
 OP2 = RobotDescription.load("darwin_op2")
@@ -118,6 +127,22 @@ def test_a_pd_servo_sags_under_gravity_as_by_hand(setup: dict[str, float]) -> No
     moment = G * setup.get("mass", MASS) * setup.get("length", LENGTH)
     rest = brentq(lambda x: stiffness * (target - x) - moment * np.sin(x), 0, target, xtol=1e-14)
     assert q == pytest.approx(rest, abs=1e-9)
+
+
+def test_a_factor_on_a_body_s_mass_leaves_what_a_knob_adds(tmp_path: Path) -> None:
+    """A load that is known tells how strong a servo is, whatever the body weighs."""
+    folder = tmp_path / "bench"
+    shutil.copytree(BENCH.folder, folder)
+    with (folder / "robot.toml").open("a") as file:
+        file.write(FACTOR)
+    robot, factor, added = RobotDescription.load(folder), 1.2, 0.5
+    time = np.arange(0, 2, 0.02)
+    runs = [
+        recording(robot, time, np.full(len(time), 0.6), setup={"mass": added + own})
+        for own in (MASS, factor * MASS)
+    ]
+    heavier = replay(robot, runs[:1], {"mass/load": factor}).position
+    np.testing.assert_allclose(heavier, replay(robot, runs[1:], {}).position, atol=1e-5)
 
 
 def test_the_torque_limit_holds_a_load_where_it_can_and_follows_the_supply() -> None:

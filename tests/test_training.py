@@ -86,6 +86,13 @@ def test_runners_sample_different_things() -> None:
     assert not np.array_equal(a.bins, b.bins)
 
 
+def test_one_that_takes_another_s_place_samples_different_things() -> None:
+    """Else what it is trained on would be the first robots over and over."""
+    a, b = (Sampler(SAMPLING, 1, life).sample(policy()) for life in (0, 7))
+    assert not np.array_equal(a.proprioception[0], b.proprioception[0])
+    assert not np.array_equal(a.bins, b.bins)
+
+
 def test_samples_of_fragments() -> None:
     """Resets are left out; returns are advantages and values together; nothing is mixed up."""
     fragments = [Sampler(SAMPLING, i).sample(policy()) for i in (1, 2)]

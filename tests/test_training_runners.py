@@ -80,6 +80,8 @@ def test_a_runner_that_hangs_is_replaced(ray_here: None, monkeypatch: pytest.Mon
             time.sleep(0.5)
         another, same = trainer.each_runner(lambda runner: os.getpid())
         assert another != first and same == second
+        lives = trainer.each_runner(lambda runner: runner.sampler.life)
+        assert lives[0] > 0 == lives[1]
 
 
 @pytest.mark.ray

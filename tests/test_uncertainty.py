@@ -10,10 +10,12 @@ from recordings import make
 from scipy.optimize import minimize
 
 from pup.physics.parameters import ParameterSpace, robot_space
+from pup.recording import Recording
+from pup.robot import RobotDescription
 from pup.sysid import ripples
 from pup.sysid.problem import Problem
 from pup.sysid.ripples import LOOKS, SCALES, Shares, Surface, surface
-from pup.sysid.slopes import Slopes, Told, slopes
+from pup.sysid.slopes import Slopes, Told, slopes, told_at
 from pup.sysid.uncertainty import _shares, by_motion, over_ripples
 
 Array = NDArray[np.float64]
@@ -63,6 +65,29 @@ def test_a_start_that_is_read_with_noise_widens_them() -> None:
     pull = WEIGHT / SPREAD * np.repeat([np.sqrt(8 / np.pi) / 3, np.sqrt(np.pi / 2) / 2], [300, 200])
     share = float((pull[:300] * first).sum() / pull.sum())
     np.testing.assert_allclose(together - alone, (0.02 * share) ** 2, rtol=0.25)
+
+
+def test_rows_of_commands_alone_make_no_interval_narrower() -> None:
+    """Readings are as alike as they were, though no two of them stand in neighbouring rows."""
+    robot = RobotDescription.load("servo_bench")
+    rng = np.random.default_rng(4)
+    time = np.arange(200) / 50
+    target = np.repeat(rng.uniform(-0.5, 0.5, 10), 20)[:, None]
+    read = 0.9 * target + 0.02 * np.sin(3 * time)[:, None]
+    told = {"robot": robot.name, "joints": robot.joint_names}
+    plain = make(time=time, target=target, position=read, **told)
+    twice = np.arange(400) / 100
+    gaps = np.full((400, 1), np.nan)
+    gaps[::2] = read
+    between = make(time=twice, target=np.repeat(target, 2, axis=0), position=gaps, **told)
+    space = robot_space(robot, "pd")
+
+    def memory(recording: Recording) -> float:
+        problem = Problem(robot, (recording,), "pd", space, ("kp/servo", "kd/servo"))
+        return told_at(problem, np.array([0.5, 0.5]))[0].memory
+
+    assert memory(plain) > 5
+    assert memory(between) == pytest.approx(memory(plain), rel=0.02)
 
 
 SHARP = np.array([[40.0, 10.0, 0.0], [10.0, 20.0, 0.0], [0.0, 0.0, 0.0]])

@@ -1,5 +1,6 @@
 """Rollouts of a batched task, as a runner of RLlib: whole arrays, no Python per simulation."""
 
+import secrets
 from collections.abc import Callable
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
@@ -144,16 +145,22 @@ class Sampler:
     Args:
       sampling: see there.
       index: of the runner.
+      life: of the runner: one that takes another's place draws other robots than that one did.
     """
 
-    def __init__(self, sampling: Sampling, index: int) -> None:
+    def __init__(self, sampling: Sampling, index: int, life: int = 0) -> None:
         self.sampling, self.index = sampling, index
-        seed = int(np.random.SeedSequence((sampling.seed, index)).generate_state(1)[0])
+        self.life = life
+        seed = int(self._entropy(index).generate_state(1)[0])
         self.task = sampling.make(sampling.simulations, seed, sampling.threads)
         self.fragments = 0
         self.returns = np.zeros(self.task.n)
         self.now: Any = None
         self._stopped = False
+
+    def _entropy(self, *of: int) -> np.random.SeedSequence:
+        life = (self.life,) if self.life else ()
+        return np.random.SeedSequence((self.sampling.seed, *of, *life))
 
     @torch.no_grad()
     def sample(self, policy: ProjectedPolicy) -> Fragment:
@@ -165,7 +172,7 @@ class Sampler:
         task, steps = self.task, self.sampling.steps
         now = task.reset() if self.now is None else self.now
         # The seed is of the fragment, so that a training that goes on needs no generator's state.
-        seed = np.random.SeedSequence((self.sampling.seed, 1 + self.index, self.fragments))
+        seed = self._entropy(1 + self.index, self.fragments)
         noise = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
         shape = (steps, task.n)
         names = ("proprioception", "parameters", "privileged")
@@ -261,7 +268,7 @@ class BatchRunner(EnvRunner, Checkpointable):
         self.sampler: Sampler | None = None
         self.trouble = ""
         try:
-            self.sampler = Sampler(self.sampling, self.worker_index) if here else None
+            self.sampler = Sampler(self.sampling, self.worker_index, _life()) if here else None
         except Exception as error:
             if not self.worker_index:
                 raise
@@ -314,6 +321,13 @@ class BatchRunner(EnvRunner, Checkpointable):
     def assert_healthy(self) -> None:
         """See EnvRunner."""
         assert self.module is not None
+
+
+def _life() -> int:
+    """Zero, or a number of its own for a runner that takes the place of one that was lost."""
+    here = ray.get_runtime_context() if ray.is_initialized() else None
+    in_place = here and here.get_actor_id() and here.was_current_actor_reconstructed
+    return 1 + secrets.randbits(62) if in_place else 0
 
 
 def _spaces(config: Any) -> dict[str, Any]:

@@ -101,8 +101,10 @@ def _apply(
         body, _, axis = place.rpartition("/")
         writer.element("body_ipos", body)[:, _AXES.index(axis)] += values
     elif kind == "mass":
-        writer.element("body_mass", place)[:] *= values
-        writer.element("body_inertia", place)[:] *= values[:, None]
+        # Of the body alone: what a knob adds to it is known.
+        own = model.compiled.body(place)
+        writer.element("body_mass", place)[:] += (values - 1) * own.mass
+        writer.element("body_inertia", place)[:] += (values - 1)[:, None] * own.inertia
     elif kind == "ground_friction":
         if model.floating:
             friction = writer.field("geom_friction")

@@ -167,12 +167,17 @@ def _moved(recording: Recording, name: str, by: float) -> Recording:
 
 
 def _lag_one(error: Array, problem: Problem) -> float:
-    """Lag-one autocorrelation of the joints' errors within recordings, at most 1 - 2/n_ticks."""
-    products, squares = 0.0, 0.0
+    """Lag-one autocorrelation of the joints' errors, at most 1 - 2/n_readings of the longest.
+
+    From reading to reading within a recording: rows without one, as of a command alone, may stand
+    between any two.
+    """
+    products, squares, longest = 0.0, 0.0, 2
     for part in problem.loss.ticks:
-        now, before = error[part][1:], error[part][:-1]
-        both = (now != 0) & (before != 0)  # an error of exactly zero was not measured
-        products += float((now * before)[both].sum())
-        squares += float(((now**2 + before**2) / 2)[both].sum())
-    longest = max(part.stop - part.start for part in problem.loss.ticks)
-    return float(np.clip(products / max(squares, 1e-300), 0.0, max(0.0, 1 - 2 / longest)))
+        for own in error[part].T:
+            read = own[own != 0]  # an error of exactly zero was not measured
+            now, before = read[1:], read[:-1]
+            products += float(now @ before)
+            squares += float(now @ now + before @ before) / 2
+            longest = max(longest, len(read))
+    return float(np.clip(products / max(squares, 1e-300), 0.0, 1 - 2 / longest))
