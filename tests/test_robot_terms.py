@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commandline import TINY, pup
-from test_robot import MODEL, ROBOT, robot_folder, swap
+from robots import MODEL, ROBOT, robot_folder, swap
 
 from pup.errors import InputError
 from pup.physics.mujoco_batch import MujocoSimulator
