@@ -183,12 +183,12 @@ class Body:
         self.guard.reset()
         self._doubt()  # from here on, whatever comes of it; some come on by a goal alone
         self.goal, self._written = senses.position.copy(), senses.time
-        self.bus.prepare(self.goal, self.settings.safety.late)
-        deaf = self.bus.without(self.goal)
-        if deaf:
+        untaken = self.bus.prepare(self.goal, self.settings.safety.late)
+        if untaken:
             self.limp()
-            told = ", ".join(self.names[self.ids.index(number)] for number in deaf[:3])
-            return Trip("enable", f"{told} did not take its goal")
+            told = [f"{self.names[self.ids.index(n)]} {what}" for n, what in untaken.items()]
+            more = f" and {len(told) - 3} more" if len(told) > 3 else ""
+            return Trip("enable", f"not taken: {', '.join(told[:3])}{more}")
         self.bus.torque(True)
         self.torque = True
         self._doubted.clear()

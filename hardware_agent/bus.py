@@ -7,8 +7,7 @@ cannot bulk read at all in release 4.1), while a tick wants what there is and wh
 
 import math
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,24 +15,17 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from numpy.typing import NDArray
 
 from hardware_agent.config import BusSettings
+from hardware_agent.keeping import kept, put_right
+from hardware_agent.line import Line
 from hardware_agent.mounting import Mounting
 from hardware_agent.plausible import Plausible
-from hardware_agent.port import FAILURES, BusError, Port, device_error
-from hardware_agent.registers import (
-    BOARD_POWER,
-    BOARD_SENSES,
-    POSITION,
-    REGISTERS,
-    Span,
-    Status,
-    hardware_alarm,
-)
-from pup.errors import InputError
+from hardware_agent.port import BusError
+from hardware_agent.registers import BOARD_POWER, BOARD_SENSES, Span, Status, hardware_alarm
 
 Array = NDArray[np.float64]
 
+ON = b"\1"
 POWER_UP = 0.3  # s until servos answer after the board gave them current (e-manual)
-PAUSE = 0.02  # s after a silence: an answer says not to which question, and may only be late
 WRITES = 2  # of a command that must arrive: a noise pulse may spoil one packet
 ERROR = {1: 4, 2: 8}
 """Place of the error byte in a status packet, by protocol; parameters follow."""
@@ -56,7 +48,7 @@ class Answers:
     tries: int
 
 
-class Bus:
+class Bus(Line):
     """The servos of a robot; the only object that writes to them.
 
     Args:
@@ -73,15 +65,11 @@ class Bus:
         senses: bool = False,
         mountings: Sequence[Mounting] | None = None,
     ) -> None:
-        self.settings = settings
-        self.ids = tuple(ids)
+        super().__init__(settings, ids)
         told = [Mounting()] * len(self.ids) if mountings is None else mountings
         self._mountings = dict(zip(self.ids, told, strict=True))
         self._reach = {name: mounting.reach for name, mounting in self._mountings.items()}
-        self.registers = REGISTERS[settings.protocol]
         self._senses = senses
-        self._port = Port(settings.port, settings.baud, settings.timeout)
-        self._packets = PacketHandler(float(settings.protocol))
         self._plausible = Plausible()
         self._turn = 0
 
@@ -98,15 +86,17 @@ class Bus:
         """
         self._port.close()
         self.take()
-        with self._told():
-            if self.settings.board:
-                self._power(self.settings.board)
-            self.torque(False)
-            missing = [name for name in self.ids if self._register(name, (0, 2)) is None]
-            if missing:
-                told = ", ".join(map(str, missing))
-                raise BusError(f"{self.settings.port}: no answer from servo {told}")
-            return [told for name in self.ids for told in self._set_up(name)]
+        if self.settings.board:
+            self._power(self.settings.board)
+        self.torque(False)
+        missing = [name for name in self.ids if self.register(name, (0, 2)) is None]
+        if missing:
+            told = ", ".join(map(str, missing))
+            raise BusError(f"{self.settings.port}: no answer from servo {told}")
+        changed = [told for name in self.ids for told in put_right(self, name)]
+        for name in self.ids:
+            self._reach[name] = self._mountings[name].span(*kept(self, name).limits)
+        return changed
 
     @property
     def reach(self) -> Array:
@@ -115,43 +105,6 @@ class Bus:
         Once opened, within the limits that it holds itself.
         """
         return np.array([self._reach[name] for name in self.ids])
-
-    def attach(self) -> None:
-        """Open the port without taking the bus: for who may have to take it over.
-
-        A port that is not there is looked for again then.
-        """
-        with suppress(BusError):
-            self._port.open()
-
-    @property
-    def descriptor(self) -> int | None:
-        """File descriptor of the port; None while it is closed."""
-        return self._port.descriptor
-
-    def take(self) -> None:
-        """Open the port and take the bus; nothing is written.
-
-        Raises:
-          BusError: the port is not there.
-          BusyError: another program owns the bus.
-        """
-        self._port.open()
-        self._port.claim()
-
-    def take_over(self) -> None:
-        """Take the bus when its owner has gone; nothing is written yet.
-
-        Raises:
-          BusError: the port is not there.
-        """
-        if not self._port.is_open:
-            self._port.open()
-        self._port.claim(wait=True)
-
-    def close(self) -> None:
-        """Give the bus up."""
-        self._port.close()
 
     def read(self) -> Answers:
         """Ask every servo; who does not answer, or what cannot be, is asked again.
@@ -179,57 +132,63 @@ class Bus:
         Args:
           goals: finite, rad, in the order of the ids.
         """
-        self._send(self.registers.goal, self._ticks(goals))
+        self.send(self.registers.goal, self._ticks(goals))
 
     def torque(self, on: bool) -> None:
         """Make all servos hold, or limp."""
         for _ in range(WRITES):
-            self._all(self.registers.torque_enable, int(on))
+            self.send_all(self.registers.torque_enable, int(on))
 
-    def prepare(self, goals: Sequence[float] | Array, deadline: float) -> None:
+    def prepare(self, goals: Sequence[float] | Array, deadline: float) -> dict[int, str]:
         """Set limp servos up such that they stay where they are when torque comes.
 
         Args:
           goals: where they are, rad.
           deadline: s without an instruction after which servos that can stop by themselves.
-        """
-        own = self.registers
-        for span, value in zip(own.gains, self.settings.gains or own.paper, strict=True):
-            self._all(span, value)
-        self._all(own.speed, 0)
-        self.soften(1.0)
-        if own.bus_watchdog:
-            self._all(own.bus_watchdog, 0)  # one that has bitten refuses goals until told so
-            self._all(own.bus_watchdog, min(127, math.ceil(deadline / 0.02)))
-        self.write(goals)
 
-    def without(self, goals: Sequence[float] | Array) -> list[int]:
-        """Servos that have other goals than these, or do not say which."""
-        wanted = self._ticks(goals)
-        with self._told():
-            return [
-                name
-                for name, goal in wanted.items()
-                if self._register(name, self.registers.goal) != goal
-            ]
+        Returns:
+          What they tell that they did not take, in words, by id: nobody answers what is told to
+          all, and a servo may refuse it.
+        """
+        own, ticks = self.registers, self._ticks(goals)
+        if own.bus_watchdog:  # one that has bitten refuses goals, power too, until told so
+            for _ in range(WRITES):
+                self.send_all(own.bus_watchdog, 0)
+            self.send_all(own.bus_watchdog, min(127, math.ceil(deadline / 0.02)))
+        for span, value in zip(own.gains, self.settings.gains or own.paper, strict=True):
+            self.send_all(span, value)
+        self.send_all(own.speed, 0)
+        self.soften(1.0)
+        self.send(own.goal, ticks)
+        power = dict.fromkeys(self.ids, own.full_power)
+        return self._untaken({"goal": (own.goal, ticks), "power limit": (own.power_limit, power)})
+
+    def _untaken(self, orders: Mapping[str, tuple[Span, Mapping[int, int]]]) -> dict[int, str]:
+        """Of registers that were written, by name, what the first is that a servo has otherwise."""
+        found: dict[int, str] = {}
+        for name in self.ids:
+            for what, (span, wanted) in orders.items():
+                told = self.register(name, span)
+                if told != wanted[name]:
+                    found[name] = f"has {what} {told} instead of {wanted[name]}"
+                    break
+        return found
 
     def soften(self, share: float) -> None:
         """Limit the servos' power to a share of what they have."""
         for _ in range(WRITES):
-            self._all(self.registers.power_limit, round(share * self.registers.full_power))
+            self.send_all(self.registers.power_limit, round(share * self.registers.full_power))
 
     def alarm(self, name: int) -> str:
         """Why a servo complains, in words."""
         if self.registers.hardware_error is None:
             return ""
-        with self._told():
-            bits = self._register(name, self.registers.hardware_error)
+        bits = self.register(name, self.registers.hardware_error)
         return "" if bits is None else hardware_alarm(bits)
 
     def torque_enabled(self, name: int) -> bool | None:
         """Whether a servo holds; None when it does not answer."""
-        with self._told():
-            told = self._register(name, self.registers.torque_enable)
+        told = self.register(name, self.registers.torque_enable)
         return None if told is None else bool(told)
 
     def _ticks(self, goals: Iterable[float]) -> dict[int, int]:
@@ -271,8 +230,7 @@ class Bus:
                     ]
             more = () if own.protocol == 1 else (False,)
             result = self._packets.bulkReadTx(port, parameters, len(parameters), *more)
-        if result != COMM_SUCCESS:
-            raise BusError(f"{self.settings.port}: {self._packets.getTxRxResult(result)}")
+        self._sent(result)
 
     def _collect(
         self,
@@ -308,107 +266,13 @@ class Bus:
             if self._plausible.believes(name, status.position, time.monotonic()):
                 found[name] = status
 
-    def _all(self, span: Span, value: int) -> None:
-        self._send(span, dict.fromkeys(self.ids, value))
-
-    def _send(self, span: Span, values: Mapping[int, int]) -> None:
-        """One packet that writes a register of many servos, who do not answer."""
-        address, length = span
-        parameters: list[int] = []
-        bulk = self.settings.write == "bulk"
-        for name, value in values.items():
-            place = [*address.to_bytes(2, "little"), *length.to_bytes(2, "little")] if bulk else []
-            parameters += [name, *place, *value.to_bytes(length, "little")]
-        with self._told():
-            port = self._use()
-            if bulk:
-                result = self._packets.bulkWriteTxOnly(port, parameters, len(parameters))
-            else:
-                result = self._packets.syncWriteTxOnly(
-                    port, address, length, parameters, len(parameters)
-                )
-        if result != COMM_SUCCESS:
-            raise BusError(f"{self.settings.port}: {self._packets.getTxRxResult(result)}")
-
     def _power(self, board: int) -> None:
         """Let the board, which speaks Protocol 1.0 whatever the servos speak, give them current."""
         packets = PacketHandler(1.0)
-        power = self._ask_one(packets, board, BOARD_POWER)
-        if power is None:
-            raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
-        if power != 1:
-            packets.writeTxRx(self._use(), board, *BOARD_POWER, [1])
-            time.sleep(POWER_UP)
-
-    def _set_up(self, name: int) -> Iterator[str]:
-        """Put a limp servo's lasting settings right."""
-        own, packets = self.registers, self._packets
-        model = self._register(name, (0, 2))
-        if model != own.model:
-            raise InputError(
-                f"{self.settings.port}: servo {name} is of model {model}, not an MX-28 with "
-                f"Protocol {own.protocol}.0 (model {own.model}); see [bus] protocol"
-            )
-        for told, span, wanted in (
-            ("return delay", own.return_delay, 0),
-            ("status return level", own.status_level, 2),
-        ):
-            known = self._register(name, span)
-            if known != wanted:
-                packets.writeTxRx(self._use(), name, *span, [wanted])
-                if self._register(name, span) != wanted:
-                    raise BusError(f"{self.settings.port}: servo {name} keeps {told} {known}")
-                yield f"servo {name}: {told} {known} made {wanted}"
-        self._reach[name] = self._own_limits(name)
-
-    def _own_limits(self, name: int) -> tuple[float, float]:
-        """Between which angles a servo takes goals, rad; beyond them it stays where it is."""
-        own, where = self.registers, f"{self.settings.port}: servo {name}"
-        mode = POSITION if own.mode is None else self._sure(name, own.mode)
-        least, largest = (self._sure(name, span) for span in own.limits)
-        if mode != POSITION:
-            raise InputError(
-                f"{where} is in operating mode {mode} and takes no angles; set mode {POSITION}, "
-                "position control, with ROBOTIS' tools"
-            )
-        if least >= largest:  # both 0 are wheel mode, both 4095 several turns
-            raise InputError(
-                f"{where} takes no angles, as its angle limits are {least} and {largest}; set "
-                "joint mode, such as limits 0 and 4095, with ROBOTIS' tools"
-            )
-        return self._mountings[name].span(least, largest)
-
-    def _sure(self, name: int, span: Span) -> int:
-        """A register as it is told twice alike: an answer may be a late one to another question."""
-        told = None
-        for _ in range(1 + self.settings.tries):
-            before, told = told, self._register(name, span)
-            if told is not None and told == before:
-                return told
-        raise BusError(f"{self.settings.port}: servo {name} does not tell its mode and limits")
-
-    def _register(self, name: int, span: Span) -> int | None:
-        """A register of one servo; None when it does not answer, however often it is asked."""
-        return self._ask_one(self._packets, name, span)
-
-    def _ask_one(self, packets: PacketHandler, name: int, span: Span) -> int | None:
-        for _ in range(self.settings.tries):
-            data, result, _ = packets.readTxRx(self._use(), name, *span)
-            if result == COMM_SUCCESS:
-                return int.from_bytes(bytes(data), "little")
-            time.sleep(PAUSE)
-        return None
-
-    def _use(self) -> Port:
-        """The port, free: with one owner and one thread, nobody else can be using it."""
-        if not self._port.is_open:
-            raise BusError(f"{self.settings.port}: is not open")
-        self._port.is_using = False
-        return self._port
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        try:
-            yield
-        except FAILURES as error:
-            raise BusError(f"{self.settings.port}: {device_error(error)}") from error
+        with self._told():
+            power = self._ask_one(packets, board, BOARD_POWER)
+            if power is None:
+                raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
+            if power != ON:
+                packets.writeTxRx(self._use(), board, *BOARD_POWER, list(ON))
+                time.sleep(POWER_UP)

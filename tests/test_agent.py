@@ -100,7 +100,7 @@ def test_the_bus_speaks_both_protocols(tmp_path: Path, mode: BusSettings) -> Non
         told = [status for status in known if status.voltage is not None]
         assert len(told) == (1 if mode.detail == "rotating" else len(IDS))
         assert all(9 < (status.voltage or 0) < 13 for status in told)
-        bus.prepare(pose, 1.0)
+        assert bus.prepare(pose, 1.0) == {}
         bus.torque(True)
         goal = pose.copy()
         goal[6] += 0.3  # the head, which moves nothing else

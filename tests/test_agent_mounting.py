@@ -139,8 +139,7 @@ def moved(bus: Bus, seconds: float = 1.0) -> dict[str, np.ndarray]:
     """What servos tell that are enabled, and whose head is told to go somewhere."""
     told = []
     pose = np.array([bus.read().servos[name].position for name in IDS])
-    bus.prepare(pose, 1.0)
-    assert bus.without(pose) == []
+    assert bus.prepare(pose, 1.0) == {}
     bus.torque(True)
     goal = pose.copy()
     for k in range(round(33 * seconds)):

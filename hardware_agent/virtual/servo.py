@@ -267,9 +267,11 @@ class Servo2(Servo):
             self._stay()
 
     def permit(self, register: Register, value: int) -> None:
-        """Goals are within the limits, and refused while the watchdog has stopped the servo."""
+        """Goals are within the limits, and refused from a watchdog's stop until it is set to 0."""
         get = self.memory.get
-        if register.name.startswith("goal_") and self.cut_off:
+        if self.cut_off and (
+            register.name.startswith("goal_") or (register.name == "bus_watchdog" and value)
+        ):
             raise RefusedError(Fault.ACCESS)
         limits = {
             "goal_position": (get("min_position"), get("max_position")),

@@ -1,0 +1,81 @@
+"""What a servo keeps without current: what of it the agent puts right, and what it leaves."""
+
+from dataclasses import dataclass
+
+from hardware_agent.line import Line
+from hardware_agent.port import BusError
+from hardware_agent.registers import POSITION
+from pup.errors import InputError
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a servo holds itself to, and the agent leaves as it is.
+
+    Attributes:
+      limits: least and largest goal, ticks; beyond them it stays where it is.
+    """
+
+    limits: tuple[int, int]
+
+
+def put_right(line: Line, name: int) -> list[str]:
+    """Put a limp servo's lasting settings right.
+
+    Args:
+      line: to the servo, open and owned.
+      name: the servo's id.
+
+    Returns:
+      What was changed, in words.
+
+    Raises:
+      BusError: it does not take a setting.
+      InputError: it is of another model.
+    """
+    own, where = line.registers, f"{line.settings.port}: servo {name}"
+    model = line.register(name, (0, 2))
+    if model != own.model:
+        raise InputError(
+            f"{where} is of model {model}, not an MX-28 with Protocol {own.protocol}.0 "
+            f"(model {own.model}); see [bus] protocol"
+        )
+    changed = []
+    for told, span, wanted in (
+        ("return delay", own.return_delay, 0),
+        ("status return level", own.status_level, 2),
+    ):
+        known = line.register(name, span)
+        if known != wanted:
+            line.put(name, span, wanted)
+            if line.register(name, span) != wanted:
+                raise BusError(f"{where} keeps {told} {known}")
+            changed.append(f"servo {name}: {told} {known} made {wanted}")
+    return changed
+
+
+def kept(line: Line, name: int) -> Kept:
+    """What a servo holds itself to.
+
+    Args:
+      line: to the servo, open and owned.
+      name: the servo's id.
+
+    Raises:
+      BusError: it does not tell.
+      InputError: it takes no angles.
+    """
+    own, where = line.registers, f"{line.settings.port}: servo {name}"
+    mode = POSITION if own.mode is None else line.sure(name, own.mode)
+    least, largest = (line.sure(name, span) for span in own.limits)
+    if mode != POSITION:
+        raise InputError(
+            f"{where} is in operating mode {mode} and takes no angles; set mode {POSITION}, "
+            "position control, with ROBOTIS' tools"
+        )
+    if least >= largest:  # both 0 are wheel mode, both 4095 several turns
+        raise InputError(
+            f"{where} takes no angles, as its angle limits are {least} and {largest}; set "
+            "joint mode, such as limits 0 and 4095, with ROBOTIS' tools"
+        )
+    return Kept((least, largest))
