@@ -21,6 +21,7 @@ PLACE = "/etc/pup-agent/agent.toml"
 SCRIPTS = "file of `pup record --scripts`, or a folder of them"
 SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
+PERSISTENCE = 2.0  # s of trying to make the robot limp without an agent
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -136,7 +137,7 @@ def _disable(options: argparse.Namespace) -> int:
     except BusError as error:
         print(f"pup-agent disable: {error}", file=sys.stderr)
         return FAILED
-    return DONE if make_limp(bus) else FAILED
+    return DONE if make_limp(bus, PERSISTENCE) else FAILED
 
 
 def _health(options: argparse.Namespace) -> int:

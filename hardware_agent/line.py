@@ -44,24 +44,16 @@ class Line:
         return self._port.descriptor
 
     def take(self) -> None:
-        """Open the port and take the bus; nothing is written.
+        """Take the bus, and open the port where that is not; nothing is written.
 
         Raises:
           BusError: the port is not there.
           BusyError: another program owns the bus.
         """
-        self._port.open()
-        self._port.claim()
-
-    def take_over(self) -> None:
-        """Take the bus when its owner has gone; nothing is written yet.
-
-        Raises:
-          BusError: the port is not there.
-        """
-        if not self._port.is_open:
-            self._port.open()
-        self._port.claim(wait=True)
+        with self._told():
+            if not self._port.is_open:
+                self._port.open()
+            self._port.claim()
 
     def close(self) -> None:
         """Give the bus up."""

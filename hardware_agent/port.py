@@ -64,17 +64,14 @@ class Port(PortHandler):  # type: ignore[misc]  # the SDK has no types
         """Its file descriptor; None while it is closed."""
         return int(self.ser.fileno()) if self.is_open else None
 
-    def claim(self, wait: bool = False) -> None:
+    def claim(self) -> None:
         """Become the owner: nobody else who asks can, until this process closes it or ends.
 
-        Args:
-          wait: until the owner there is has gone.
-
         Raises:
-          BusyError: there is an owner, and no waiting.
+          BusyError: there is an owner.
         """
         try:
-            fcntl.flock(self.ser.fileno(), fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            fcntl.flock(self.ser.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise BusyError(
                 f"{self.port_name}: another program owns the bus; end it, or is an agent running?"

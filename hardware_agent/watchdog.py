@@ -4,7 +4,8 @@ The agent and this process hold the ends of a socket pair. The agent sends a byt
 says whether torque is on. When the agent dies, the kernel closes its end, and this process knows at
 once; when it hangs with torque on, this process kills it. The bus has one owner: the lock that the
 agent holds on the port falls when its process is gone, and only then this process takes it and
-writes. Its own port was opened before, so that nothing can go wrong with that any more.
+writes. Its own port was opened before, so that nothing can go wrong with that any more; where it
+does, or no servo answers, it tries again for two minutes, or until another agent has the bus.
 
 Run as `python -m hardware_agent.watchdog`, it imports only what it needs: 20 MB instead of 70.
 """
@@ -17,7 +18,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,9 @@ if TYPE_CHECKING:  # imported where it is needed: the process is small, and star
     from hardware_agent.bus import Bus
 
 ON, OFF, READY, ENDED = b"1", b"0", b"r", b"e"
-PERSISTENCE = 2.0  # s, of trying to make the robot limp
+PERSISTENCE = 120.0  # s, of trying to make the robot limp: an adapter may be put in again
+AGAIN = 0.25  # s between two tries, in which the next agent may take the bus
+PATIENCE = 3.0  # s for which an agent that ends waits for it
 SPACING = 0.004  # s between packets: a servo's answer may have garbled the first
 
 
@@ -86,7 +89,8 @@ class Watchdog:
         with suppress(OSError):  # what is full or gone needs no word
             self._socket.send(ENDED)
         self._socket.close()
-        self._process.wait(timeout=10.0)
+        with suppress(subprocess.TimeoutExpired):  # no servo answers it; it goes on trying alone
+            self._process.wait(timeout=PATIENCE)
 
 
 def watch(beats: socket.socket, agent: int, timeout: float, bus: "Bus") -> str:
@@ -132,40 +136,53 @@ def watch(beats: socket.socket, agent: int, timeout: float, bus: "Bus") -> str:
         torque = told[-1:] == ON
 
 
-def make_limp(bus: "object") -> bool:
-    """Torque off, until every servo that answers says so.
+def make_limp(bus: "Bus", persistence: float, orphaned: Callable[[], bool] = lambda: True) -> bool:
+    """Take the bus and turn torque off, until every servo that answers says so.
 
     Args:
-      bus: open and owned.
+      bus: of the servos; it is let go between two tries.
+      persistence: for how long to try, s.
+      orphaned: whether its owner is gone: who else has it then makes the robot limp itself.
 
     Returns:
-      Whether a servo answered at all.
+      Whether a servo answered, and none holds.
     """
-    from hardware_agent.bus import Bus
     from hardware_agent.port import BusError, BusyError
 
-    assert isinstance(bus, Bus)
-    deadline = time.monotonic() + PERSISTENCE
+    deadline, said = time.monotonic() + persistence, ""
     while time.monotonic() < deadline:
+        holding: set[bool | None] = set()
         try:
-            bus.torque(False)
-            time.sleep(SPACING)
-            bus.torque(False)
-            told = [bus.torque_enabled(name) for name in bus.ids]
-        except BusError as error:
-            print(f"watchdog: {error}", file=sys.stderr)
-            time.sleep(0.05)
-            bus.close()  # an adapter that was out and in again does not answer an old handle
-            try:
-                bus.take()
-            except BusyError:  # another agent has it by now, which makes the robot limp
+            bus.take()
+            holding = _let_go(bus)
+        except BusyError:
+            if orphaned():
                 return False
-            except BusError:
-                pass  # it is told in the next round
+        except BusError as error:
+            if str(error) != said:
+                said = str(error)
+                _say(said)
+        if True in holding:
             continue
-        if True not in told and False in told:
+        if False in holding:
             return True
+        bus.close()  # an adapter that was out and in again does not answer an old handle
+        time.sleep(AGAIN)
     return False
+
+
+def _let_go(bus: "Bus") -> set[bool | None]:
+    """Turn torque off; whether servos hold none the less, None of those that do not answer."""
+    bus.torque(False)
+    time.sleep(SPACING)
+    bus.torque(False)
+    return {bus.torque_enabled(name) for name in bus.ids}
+
+
+def _say(text: str) -> None:
+    """Tell it where somebody listens; the robot is made limp where nobody does, too."""
+    with suppress(OSError, ValueError):
+        print(f"watchdog: {text}", file=sys.stderr, flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -189,9 +206,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bus.attach()
     beats.send(READY)
     told = watch(beats, agent, options.timeout, bus)
-    bus.take_over()
-    safe = make_limp(bus)
-    print(f"watchdog: {told}; {'torque is off' if safe else 'no servo answered'}", file=sys.stderr)
+    safe = make_limp(bus, PERSISTENCE, lambda: bool(select.select([agent], [], [], 0)[0]))
+    _say(f"{told}; {'torque is off' if safe else 'no servo answered'}")
     return 0 if safe else 1
 
 

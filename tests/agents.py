@@ -201,10 +201,14 @@ class Lab:
 
     def start(self) -> None:
         """Start the agent and wait until it listens and has the robot."""
+        self.start_silent()
+        wait(lambda: self.ready(), 30, self.log)
+
+    def start_silent(self) -> None:
+        """Start the agent of a robot that does not answer yet."""
         log = (self.folder / "agent.log").open("ab")
         command = [sys.executable, "-m", "hardware_agent.cli", "run", "--config", str(self.config)]
         self.agent = subprocess.Popen(command, stderr=log, stdout=log)
-        wait(lambda: self.ready(), 30, self.log)
 
     def ready(self) -> bool:
         assert self.agent is not None and self.agent.poll() is None, self.log()

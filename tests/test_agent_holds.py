@@ -115,6 +115,36 @@ def test_the_watchdog_finds_an_adapter_that_was_out_and_in_again(tmp_path: Path)
         wait(lambda: holding(made) == 0, 10, made.log)
 
 
+def test_the_watchdog_waits_for_an_adapter_that_is_out_when_the_agent_is_killed(
+    tmp_path: Path,
+) -> None:
+    """With nobody left who could tell the servos, it may be in again only after a while."""
+    with lab(tmp_path) as made:
+        made.start()
+        enabled(made)
+        pull_port(made)
+        assert holding(made) == 20
+        made.kill()
+        time.sleep(4.0)
+        made.side(cmd="fault", kind="port_pulled", off=True)
+        wait(lambda: holding(made) == 0, 10, made.log)
+        wait(lambda: "the agent has ended; torque is off" in made.log(), 10, made.log)
+
+
+def test_a_watchdog_that_finds_nobody_leaves_the_bus_to_the_next_agent(tmp_path: Path) -> None:
+    with lab(tmp_path) as made:
+        made.start()
+        enabled(made)
+        made.side(cmd="fault", kind="bus_pulled")
+        made.kill()
+        time.sleep(1.0)
+        made.start_silent()
+        made.side(cmd="fault", kind="bus_pulled", off=True)
+        wait(made.ready, 20, made.log)
+        wait(lambda: holding(made) == 0, 10, made.log)
+        assert "owns the bus" not in made.log()
+
+
 def test_servos_whose_cable_was_out_are_made_limp_when_it_is_back(tmp_path: Path) -> None:
     with lab(tmp_path) as made:
         made.start()
