@@ -21,7 +21,6 @@ PLACE = "/etc/pup-agent/agent.toml"
 SCRIPTS = "file of `pup record --scripts`, or a folder of them"
 SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
-PERSISTENCE = 2.0  # s of trying to make the robot limp without an agent
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -48,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
         ("run", "run the agent; the robot does not move until it is enabled"),
         ("enable", "torque on, holding the pose that the robot is in"),
         ("disable", "torque off, also when no agent runs; the robot goes limp"),
-        ("stop", "emergency stop: torque off at once"),
+        ("stop", "emergency stop: torque off at once, also when no agent runs"),
         ("health", "tell how the agent is; exit code 0 when it is well, 1 when not"),
         ("operate", "stand at the robot: start trials, stop them, type distances"),
         ("arm", "let the trial that waits start"),
@@ -102,42 +101,15 @@ def _say(do: str, **more: Any) -> Any:
     return verb
 
 
-def _stop(options: argparse.Namespace) -> int:
-    told = say(Settings.read(options.config).socket, {"do": "stop"})
-    if not told["limp"]:
-        print(
-            "pup-agent stop: not every servo says that it is limp; use the power switch",
-            file=sys.stderr,
-        )
-    return DONE if told["limp"] else FAILED
-
-
 def _distance(options: argparse.Namespace) -> int:
     say(Settings.read(options.config).socket, {"do": "distance", "distance": options.metres})
     return DONE
 
 
-def _disable(options: argparse.Namespace) -> int:
-    """Ask the agent; without one, take the bus and do it."""
-    settings = Settings.read(options.config)
-    try:
-        say(settings.socket, {"do": "disable"})
-        return DONE
-    except Unreachable:
-        pass
-    from hardware_agent.bus import Bus
-    from hardware_agent.port import BusError
-    from hardware_agent.watchdog import make_limp
-    from pup.robot import RobotDescription
+def _limp(options: argparse.Namespace) -> int:
+    from hardware_agent.stopping import make_limp
 
-    joints = RobotDescription.load(settings.robot).joints
-    bus = Bus(settings.bus, [j.servo_id for j in joints if j.servo_id is not None])
-    try:
-        bus.take()
-    except BusError as error:
-        print(f"pup-agent disable: {error}", file=sys.stderr)
-        return FAILED
-    return DONE if make_limp(bus, PERSISTENCE) else FAILED
+    return DONE if make_limp(options.config, options.verb) else FAILED
 
 
 def _health(options: argparse.Namespace) -> int:
@@ -226,8 +198,8 @@ def _keys(options: argparse.Namespace) -> int:
 VERBS = {
     "run": _run,
     "enable": _say("enable"),
-    "disable": _disable,
-    "stop": _stop,
+    "disable": _limp,
+    "stop": _limp,
     "health": _health,
     "operate": _operate,
     "arm": _say("arm"),
