@@ -12,6 +12,7 @@ from hardware_agent.imu import Orientation, imu_of
 from hardware_agent.limits import Applied, Limiter
 from hardware_agent.mounting import Mounting
 from hardware_agent.port import BusError
+from hardware_agent.registers import REGISTERS
 from hardware_agent.safety import Guard
 from hardware_agent.senses import Response, Senses, Trip
 from pup.errors import InputError
@@ -49,7 +50,8 @@ class Body:
         mountings = _mountings(settings.bus, robot)
         senses = settings.imu.kind == "cm740"
         self.bus = Bus(settings.bus, self.ids, senses, mountings)
-        self.guard = Guard(settings.safety, robot.gait.tilt_limit if robot.gait else TILT)
+        tilt = robot.gait.tilt_limit if robot.gait else TILT
+        self.guard = Guard(settings.safety, tilt, _gain(settings.bus))
         self._limit()
         self.torque = self.ready = False
         self.repeated = self.lost = 0
@@ -286,6 +288,11 @@ class Body:
         except BusError:
             return False
         return True
+
+
+def _gain(settings: BusSettings) -> float:
+    """The servos' P gain as a share of the paper's."""
+    return settings.gains[0] / REGISTERS[settings.protocol].paper[0] if settings.gains else 1.0
 
 
 def _mountings(settings: BusSettings, robot: RobotDescription) -> list[Mounting]:

@@ -115,7 +115,8 @@ class SafetySettings:
         stalled motor is given up after 11 s, a knee that walks at 0.8 after 21 s.
       current_time: over which it is taken, s.
       rested: share of that heat (I²t) below which a trial starts.
-      duty_per_radian: of the servo's P gain, to tell the current (fitted, MX-28 at P 32).
+      duty_per_radian: of the servo's P gain, to tell the current; None for 6.28 (fitted, MX-28 at
+        the paper's P), scaled by that of `[bus] gains`.
       free_speed: without load, rad/s, likewise.
       lag: time constant with which a joint follows its target, s, likewise.
       stuck_time: after which an encoder that does not move is stuck, s.
@@ -137,7 +138,7 @@ class SafetySettings:
     current: float = 0.65
     current_time: float = 20.0
     rested: float = 0.4
-    duty_per_radian: float = 6.28
+    duty_per_radian: float | None = None
     free_speed: float = 3.9
     lag: float = 0.05
     stuck_time: float = 0.18

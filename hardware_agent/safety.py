@@ -17,6 +17,8 @@ from hardware_agent.senses import Response, Senses, Trip
 
 Array = NDArray[np.float64]
 
+DUTY_PER_RADIAN = 6.28  # of an MX-28 with the paper's P gain (fitted)
+
 
 class Rule(Protocol):
     """A rule of safety."""
@@ -204,12 +206,18 @@ class Overload:
 
     The duty that the firmware gives for the position error, less what back-EMF takes from it, is
     the current as a share of the stall current; its square is averaged over some time.
+
+    Args:
+      limits: of the configuration.
+      gain: the servos' P gain as a share of the paper's.
     """
 
     name, response = "overload", Response.LIMP
 
-    def __init__(self, limits: SafetySettings) -> None:
+    def __init__(self, limits: SafetySettings, gain: float) -> None:
         self._limits = limits
+        own = limits.duty_per_radian
+        self._duty_per_radian = gain * DUTY_PER_RADIAN if own is None else own
         self._heat: Array = np.zeros(1)  # of each joint, once they are known
         self._last: Senses | None = None
 
@@ -239,7 +247,7 @@ class Overload:
             return None
         step = senses.time - last.time
         speed = (senses.position - last.position) / max(step, 1e-3)
-        duty = np.clip(limits.duty_per_radian * (last.goal - senses.position), -1.0, 1.0)
+        duty = np.clip(self._duty_per_radian * (last.goal - senses.position), -1.0, 1.0)
         current = np.nan_to_num(duty - speed / limits.free_speed)
         share = min(1.0, step / limits.current_time)
         self._heat = self._heat + share * (np.clip(current, -1.5, 1.5) ** 2 - self._heat)
@@ -331,10 +339,11 @@ class Guard:
     Args:
       limits: of the configuration.
       tilt: of the robot's gait, rad.
+      gain: the servos' P gain as a share of the paper's.
     """
 
-    def __init__(self, limits: SafetySettings, tilt: float) -> None:
-        self._overload = Overload(limits)
+    def __init__(self, limits: SafetySettings, tilt: float, gain: float = 1.0) -> None:
+        self._overload = Overload(limits, gain)
         self.rules: list[Rule] = [rule(limits) for rule in RULES]
         self.rules += [self._overload, Fall(limits, tilt)]
 

@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agents import CONFIG, DARWIN, changed
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware_agent.config import SafetySettings
+from hardware_agent.body import Body
+from hardware_agent.config import SafetySettings, Settings
 from hardware_agent.imu import Board, Orientation
 from hardware_agent.limits import Applied, Limiter
 from hardware_agent.metronome import Metronome
@@ -179,6 +181,31 @@ def test_a_motor_may_give_much_for_a_moment_but_not_for_long() -> None:
     guard = Guard(LIMITS, 1.0)
     assert given_up(guard, 10.0) == pytest.approx(-20 * math.log(1 - 0.65**2), rel=0.05)
     assert guard.heat == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("protocol", "gain"), [(1, 64), (2, 1024), (1, 254)])
+def test_a_motor_with_another_gain_is_given_up_for_its_current_too(
+    tmp_path: Path, protocol: int, gain: int
+) -> None:
+    """A blocked joint at full duty, for which a servo of twice the gain needs half the error."""
+    paper = REGISTERS[protocol].paper[0]
+    text = CONFIG.format(folder=tmp_path, protocol=protocol, clock="wall")
+    file = tmp_path / "agent.toml"
+
+    def blocked(more: str) -> Trip | None:
+        file.write_text(changed(text, f"[bus]\ngains = [{gain}, 0, 0]\n{more}"))
+        guard = Body(Settings.read(file), DARWIN).guard
+        error = 1.05 / 6.28 * paper / gain
+        shown = {"goal": POSE + at(1, error, 0.0), "imu": None, "has_imu": False}
+        for t in np.arange(0.0, 20.0, PERIOD):
+            trip = guard.check(senses(10.0 + t, **shown))
+            if trip is not None:
+                return trip
+        return None
+
+    told = blocked("")
+    assert told is not None and told.rule == "overload"
+    assert blocked("[safety]\nduty_per_radian = 0.5\n") is None, "set by hand"
 
 
 @pytest.mark.parametrize("rest", [0.0, 20.0, 200.0])
