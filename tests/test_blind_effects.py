@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pup.blind.absorb import readings
 from pup.blind.catalogue import CLASS_OF, CLASSES, KINDS, available, draw, unlisted
 from pup.blind.kit import Kit
+from pup.blind.reference import readings
 from pup.blind.world import Effect, Nominal, Plan, World
 from pup.robot import RobotDescription
 

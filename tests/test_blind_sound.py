@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from test_blind_effects import plans, world_of
 
-from pup.blind.absorb import readings
 from pup.blind.catalogue import KINDS, MASKED, available, draw, plausible, unlisted
 from pup.blind.drafts import NUISANCE, draw_case, draw_null
 from pup.blind.kit import Kit
 from pup.blind.make import ROBOTS
+from pup.blind.reference import readings
 from pup.blind.sensors import Noise
 from pup.blind.setting import NULLS, STRATA, Setting, setting
 from pup.blind.sound import converged, shrinks

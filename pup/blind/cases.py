@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from pup.blind.absorb import FAINT, MATERIAL, Reference, Visibility, readings
+from pup.blind.absorb import CLEAR, FAINT, MATERIAL, Visibility, labelled, visibility
 from pup.blind.catalogue import COMPARABLE, KINDS
 from pup.blind.drafts import Draft, draw_case, draw_null
-from pup.blind.sensors import Noise, measure
+from pup.blind.reference import Reference, readings
+from pup.blind.sensors import measure
 from pup.blind.setting import setting
 from pup.blind.sound import check
 from pup.blind.world import Effect
@@ -17,9 +18,7 @@ from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
-CLEAR = 10.0  # SNR from which an effect below the noise is detectable without doubt
-HIDDEN = 0.5  # share absorbed from which an effect counts as masked
-ROUNDS = 2  # of a refit that is measured
+ROUNDS = 2  # steps of a refit that is measured
 REDRAWS, TUNINGS, CALMINGS = 30, 4, 2
 STRICT = 12  # redraws in which a case must turn out to be of the stratum that it is drawn for
 VERDICTS = ("mismatch", "none", "undetermined")
@@ -105,7 +104,7 @@ def _finished(draft: Draft, rng: np.random.Generator, id: str, strict: bool) -> 
         reference = Reference.of(draft.world, draft.plans, draft.values)
         draft, seen, alone = _tuned(draft, reference)
         each = _each(draft, reference) if len(draft.effects) > 1 else [alone]
-        stratum = _label(draft.stratum, alone, draft.noise)
+        stratum = labelled(draft.stratum, alone.document(), draft.noise.sigma)
         faint = draft.stratum != "unidentifiable" and alone.snr < FAINT
         missed = stratum != draft.stratum and (
             strict or (draft.stratum in ("single", "masked") and stratum == "weak")
@@ -115,7 +114,7 @@ def _finished(draft: Draft, rng: np.random.Generator, id: str, strict: bool) -> 
         check(draft, reference, seen)
         everything = alone
         if draft.nuisance:
-            everything = reference.visibility(seen, draft.noise, rounds=ROUNDS)
+            everything = visibility(reference, seen, draft.noise, rounds=ROUNDS)
         slight = bool(draft.answers) and alone.gain <= MATERIAL
         allowed = VERDICTS if stratum == "weak" or slight else draft.verdicts or ("mismatch",)
         truth = _truth(draft, id, stratum, allowed) | {
@@ -138,7 +137,7 @@ def _calmed(draft: Draft) -> tuple[Draft, Mapping[str, Any], Visibility]:
     reference = Reference.of(draft.world, draft.plans, draft.values)
     for turn in range(CALMINGS + 1):
         seen = readings(draft.full(), draft.plans)[0]
-        view = reference.visibility(seen, draft.noise, rounds=ROUNDS)
+        view = visibility(reference, seen, draft.noise, rounds=ROUNDS)
         if view.gain <= MATERIAL or not draft.nuisance or turn == CALMINGS:
             break
         draft = replace(draft, nuisance=tuple(effect.scaled(0.5) for effect in draft.nuisance))
@@ -156,10 +155,10 @@ def _tuned(draft: Draft, reference: Reference) -> tuple[Draft, Mapping[str, Any]
         background = readings(replace(draft.world, effects=draft.nuisance), draft.plans)[0]
     for turn in range(TUNINGS + 1):
         seen = readings(draft.full(), draft.plans)[0]
-        alone = reference.visibility(seen, draft.noise, background)
+        alone = visibility(reference, seen, draft.noise, background)
         factor = _correction(draft, alone)
         if factor == 1.0 or turn == TUNINGS:
-            alone = reference.visibility(seen, draft.noise, background, ROUNDS)
+            alone = visibility(reference, seen, draft.noise, background, ROUNDS)
             break
         draft = draft.resized(factor)
     return draft, seen, alone
@@ -170,7 +169,7 @@ def _each(draft: Draft, reference: Reference) -> list[Visibility]:
     views = []
     for effect in draft.effects:
         seen = readings(replace(draft.world, effects=(effect,)), reference.plans)[0]
-        views.append(reference.visibility(seen, draft.noise))
+        views.append(visibility(reference, seen, draft.noise))
     return views
 
 
@@ -188,17 +187,6 @@ def _correction(draft: Draft, found: Visibility) -> float:
     return 1.0
 
 
-def _label(stratum: str, found: Visibility, noise: Noise) -> str:
-    """The stratum a single omission belongs to by what it turned out to do."""
-    if stratum not in ("single", "below_noise", "weak", "masked"):
-        return stratum
-    if found.snr < CLEAR:
-        return "weak"
-    if found.absorbed >= HIDDEN and stratum in ("masked", "single"):
-        return "masked"
-    return "below_noise" if found.left < noise.sigma else "single"
-
-
 def _truth(draft: Draft, id: str, stratum: str, verdicts: Sequence[str]) -> dict[str, Any]:
     """The case's entry in the key, but for what can be seen of it."""
     return {
@@ -210,6 +198,7 @@ def _truth(draft: Draft, id: str, stratum: str, verdicts: Sequence[str]) -> dict
         "effects": [effect.document() | _besides(effect) for effect in draft.effects],
         "nuisance": [effect.document() for effect in draft.nuisance],
         "nominal": dict(draft.values),
+        "physics_seed": draft.world.seed,
         "engine": draft.world.engine.document(),
         "noise": {**vars(draft.noise), "sigma": draft.noise.sigma},
         "answer": {"verdicts": list(verdicts), "set": list(draft.answers)},

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pup.blind.absorb import readings
 from pup.blind.catalogue import CLASS_OF, KINDS, MASKED, available, draw, plausible, unlisted
 from pup.blind.kit import Kit
 from pup.blind.programme import programme
+from pup.blind.reference import readings
 from pup.blind.sensors import Noise
 from pup.blind.setting import Setting
 from pup.blind.world import STEP, Effect, Engine, Nominal, Plan, World, nominal_names, steady

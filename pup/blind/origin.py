@@ -13,7 +13,7 @@ FILES = (
     *("blind/*.py", "robots/*/*.toml", "robots/*/*.xml", "robot*.py", "recording*.py"),
     *("sysid/clearance.py", "sysid/excitation.py", "sysid/lean.py"),
 )
-SCORER = ("judge.py", "places.py", "score.py", "statistics.py", "table.py")
+SCORER = ("bound.py", "judge.py", "places.py", "score.py", "statistics.py", "table.py")
 """Files beside the generator's that have no part in what a set is."""
 PACKAGES = ("pup", "mujoco", "numpy", "scipy", "pyarrow")
 

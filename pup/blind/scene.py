@@ -37,7 +37,7 @@ class Scene:
         self.shape = (len(nominals), len(plans), len(world.robot.joints))
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qacc, self.force = self.batch.bind("qacc"), self.batch.bind("qfrc_applied")
-        self.kp, self.kd, self.tau_max = _gains(world, plans, nominals)
+        self.kp, self.kd, self.tau_max = gains(world, plans, nominals)
         rotor = np.array(self.batch.expand("dof_armature"))[:, mechanism.dofs]
         setups = [world.robot.setup(plan.setup) for plan in plans]
         volts = [setup.get("vin", setup.get("supply_voltage", 1.0)) for setup in setups]
@@ -156,7 +156,7 @@ class Scene:
         self.ranges, self.ctrl = self.batch.expand("actuator_forcerange"), self.batch.bind("ctrl")
 
 
-def _gains(
+def gains(
     world: World, plans: Sequence[Plan], nominals: Sequence[Nominal]
 ) -> tuple[Array, Array, Array]:
     """Stiffness, damping and torque limit of every lane, with the plans' setups."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pup.blind.absorb import MATERIAL
+from pup.blind.bound import Lower, bounded
 from pup.blind.judge import Judged, judge
 from pup.blind.seal import COMMITMENT, verify
 from pup.blind.statistics import calibration, mean, share
@@ -63,7 +64,8 @@ def score_set(
 
     Returns:
       The scores, as JSON values. `all` and the robots' scores leave out the stratum `weak` and what
-      is immaterial; the former is among `per_stratum`, the latter among `lines`.
+      is immaterial; the former is among `per_stratum`, the latter among `lines`. `refits` tells
+      where a diagnosis's nominal model comes nearer to the truth than the key's refit and counts.
 
     Raises:
       InputError: the key or the set is not the one committed to, or no diagnosis is of its cases.
@@ -73,12 +75,13 @@ def score_set(
         raise InputError(f"{diagnoses}: no case_<id>/{DIAGNOSIS} of a case of this set in it")
     truths = [t for t in known if only is None or t["id"] in only]
     robots = {name: RobotDescription.load(name) for name in {t["robot"] for t in truths}}
-    judged = []
+    judged, bounds = [], []
     for truth in truths:
-        name = f"case_{truth['id']}"
-        judged.append(
-            _judged(truth, folder / name, diagnoses / name, robots[truth["robot"]], replay)
-        )
+        name, robot = f"case_{truth['id']}", robots[truth["robot"]]
+        document = _diagnosis(diagnoses / name / DIAGNOSIS) or {}
+        entry, lower = bounded(truth, folder / name, robot, document.get("nominal"))
+        bounds.append((truth, entry, lower))
+        judged.append(_judged(entry, folder / name, diagnoses / name, robot, replay))
         report(len(judged), len(truths))
     real = [case for case in judged if not case.null]
     counted = [case for case in real if case.stratum != "weak" and not case.immaterial]
@@ -105,6 +108,7 @@ def score_set(
             for name in sorted(robots)
         },
         **_calibrations(judged),
+        "refits": _refits(bounds),
         "failures": [_failure(case) for case in judged if _faults(case)],
     }
 
@@ -126,6 +130,26 @@ def _judged(
         raise InputError(
             f"{diagnosed / DIAGNOSIS}: does not follow the contract ({error!r})"
         ) from error
+
+
+def _refits(
+    bounds: Sequence[tuple[Mapping[str, Any], Mapping[str, Any], Lower | None]],
+) -> dict[str, Any]:
+    """Where a diagnosis's nominal model comes nearer to the truth than the key's refit."""
+    return {
+        "compared": sum(lower is not None for _, _, lower in bounds),
+        "lower": [
+            {
+                "case": truth["id"],
+                "robot": truth["robot"],
+                "stratum": truth["stratum"],
+                "counted_as": counted["stratum"],
+                **lower,
+            }
+            for truth, counted, lower in bounds
+            if lower
+        ],
+    }
 
 
 def _repeats(recordings: Path) -> set[str]:

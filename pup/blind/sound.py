@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pup.blind.absorb import Reference, readings
 from pup.blind.drafts import Draft
+from pup.blind.reference import Reference, readings
 from pup.blind.sensors import Noise, Seen
 from pup.blind.world import Array, Effect, Plan, World
 from pup.errors import InputError

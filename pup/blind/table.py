@@ -44,6 +44,7 @@ LINES = {
     "immaterial": "immaterial, of any stratum",
     "masked_85": "masked, 85 % absorbed",
 }
+VIEWS = {"effect_seen": "effect", "all_seen": "all"}
 FEW = ("detected", "exact_top1", "class_top1", "class_top3", "place_top1", "set_covers")
 
 
@@ -73,6 +74,8 @@ def markdown(scores: Mapping[str, Any]) -> str:
         "",
         *few("robot", scores["per_robot"]),
         "",
+        *_refits(scores["refits"]),
+        "",
         f"## Failures: {len(scores['failures'])}",
         "",
         "| case | robot | stratum | what | named |",
@@ -84,6 +87,26 @@ def markdown(scores: Mapping[str, Any]) -> str:
         ),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _refits(refits: Mapping[str, Any]) -> list[str]:
+    """Where a diagnosis's nominal model takes the place of the key's refit."""
+    lower, compared = refits["lower"], refits["compared"]
+    lines = [
+        f"## Refits nearer to the truth than the key's: {len(lower)} of {compared} compared",
+        "",
+        "| case | robot | stratum | counted as | what | SNR, key | SNR, counted "
+        "| absorbed, key | absorbed, counted |",
+        "|---" * 9 + "|",
+    ]
+    for case in lower:
+        who = " | ".join(str(case[name]) for name in ("case", "robot", "stratum", "counted_as"))
+        for view, told in VIEWS.items():
+            if seen := case.get(view):
+                snr = f"{seen['key_snr']:.1f} | {seen['snr']:.1f}"
+                share = f"{seen['key_absorbed']:.2f} | {seen['absorbed']:.2f}"
+                lines.append(f"| {who} | {told} | {snr} | {share} |")
+    return lines
 
 
 def _engine(told: Mapping[str, Any] | None) -> str:

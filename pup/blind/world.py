@@ -76,6 +76,20 @@ class Effect:
         """The same effect with `factor` times as much of it."""
         return replace(self, size=self.size / factor if self.inverse else self.size * factor)
 
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> "Effect":
+        """From the key, to be simulated; which way its size counts is not in there."""
+        place, size = document["place"], document["size"]
+        return cls(
+            document["effect"],
+            Place(place["kind"], tuple(place["names"])),
+            size["value"],
+            size["name"],
+            size["unit"],
+            document["shape"],
+            document["form"],
+        )
+
     def document(self) -> dict[str, Any]:
         """As in the key."""
         return {
