@@ -58,14 +58,20 @@ class Body:
         self._forget()
 
     def _limit(self) -> list[str]:
-        """Keep targets where the servos take them; tells of joints that these hold back."""
+        """Keep targets where the servos take them; tells what these hold back, and who is weak."""
         reach, (lower, upper) = self.bus.reach, self._robot.limits
         self.limiter = Limiter(self.names, *_reached(self._robot, reach), self.settings.safety)
-        return [
+        ranges = [
             f"servo {self.ids[j]} takes {self.names[j]} from {low:.2f} to {high:.2f} rad only"
             for j, (low, high) in enumerate(reach)
             if low > lower[j] + MISSED or high < upper[j] - MISSED
         ]
+        weak = [
+            f"servo {self.ids[j]} gives {self.names[j]} {share:.0%} of its power at most"
+            for j, share in enumerate(self.bus.strength)
+            if share < 1
+        ]
+        return ranges + weak
 
     def _forget(self) -> None:
         n = len(self.names)
@@ -89,8 +95,8 @@ class Body:
         """Take the bus and the IMU; the servos are limp afterwards.
 
         Returns:
-          What was put right in the servos, and how far they go where that is not all of a
-          joint's range.
+          What was put right in the servos, how far they go where that is not all of a joint's
+          range, and who has not all of its power.
 
         Raises:
           BusError: something does not answer.

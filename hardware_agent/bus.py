@@ -48,6 +48,21 @@ class Answers:
     tries: int
 
 
+@dataclass(frozen=True)
+class Order:
+    """What a register of all servos shall say.
+
+    Attributes:
+      name: in words.
+      span: of the register.
+      values: by id.
+    """
+
+    name: str
+    span: Span
+    values: Mapping[int, int]
+
+
 class Bus(Line):
     """The servos of a robot; the only object that writes to them.
 
@@ -68,6 +83,7 @@ class Bus(Line):
         super().__init__(settings, ids)
         told = [Mounting()] * len(self.ids) if mountings is None else mountings
         self._mountings = dict(zip(self.ids, told, strict=True))
+        self._most = dict.fromkeys(self.ids, self.registers.full_power)
         self._reach = {name: mounting.reach for name, mounting in self._mountings.items()}
         self._senses = senses
         self._plausible = Plausible()
@@ -87,7 +103,7 @@ class Bus(Line):
         self._port.close()
         self.take()
         if self.settings.board:
-            self._power(self.settings.board)
+            self._switch_on(self.settings.board)
         self.torque(False)
         missing = [name for name in self.ids if self.register(name, (0, 2)) is None]
         if missing:
@@ -95,7 +111,9 @@ class Bus(Line):
             raise BusError(f"{self.settings.port}: no answer from servo {told}")
         changed = [told for name in self.ids for told in put_right(self, name)]
         for name in self.ids:
-            self._reach[name] = self._mountings[name].span(*kept(self, name).limits)
+            own = kept(self, name)
+            self._reach[name] = self._mountings[name].span(*own.limits)
+            self._most[name] = own.power
         return changed
 
     @property
@@ -105,6 +123,11 @@ class Bus(Line):
         Once opened, within the limits that it holds itself.
         """
         return np.array([self._reach[name] for name in self.ids])
+
+    @property
+    def strength(self) -> Array:
+        """Share of full power that each servo allows itself, once opened, shape (n_servos,)."""
+        return np.array([self._most[name] for name in self.ids]) / self.registers.full_power
 
     def read(self) -> Answers:
         """Ask every servo; who does not answer, or what cannot be, is asked again.
@@ -150,34 +173,55 @@ class Bus(Line):
           What they tell that they did not take, in words, by id: nobody answers what is told to
           all, and a servo may refuse it.
         """
-        own, ticks = self.registers, self._ticks(goals)
+        own = self.registers
         if own.bus_watchdog:  # one that has bitten refuses goals, power too, until told so
             for _ in range(WRITES):
                 self.send_all(own.bus_watchdog, 0)
-            self.send_all(own.bus_watchdog, min(127, math.ceil(deadline / 0.02)))
-        for span, value in zip(own.gains, self.settings.gains or own.paper, strict=True):
-            self.send_all(span, value)
-        self.send_all(own.speed, 0)
-        self.soften(1.0)
-        self.send(own.goal, ticks)
-        power = dict.fromkeys(self.ids, own.full_power)
-        return self._untaken({"goal": (own.goal, ticks), "power limit": (own.power_limit, power)})
+        orders = self._orders(goals, deadline)
+        for order in orders:
+            for _ in range(1 if order.span == own.goal else WRITES):  # time waits for goals
+                self.send(order.span, order.values)
+        return {n: told for n in self.ids if (told := self._untaken(n, orders)) is not None}
 
-    def _untaken(self, orders: Mapping[str, tuple[Span, Mapping[int, int]]]) -> dict[int, str]:
-        """Of registers that were written, by name, what the first is that a servo has otherwise."""
-        found: dict[int, str] = {}
-        for name in self.ids:
-            for what, (span, wanted) in orders.items():
-                told = self.register(name, span)
-                if told != wanted[name]:
-                    found[name] = f"has {what} {told} instead of {wanted[name]}"
-                    break
-        return found
+    def _orders(self, goals: Sequence[float] | Array, deadline: float) -> list[Order]:
+        """What servos shall have in their registers before they hold, the goal last."""
+        own = self.registers
+        same = {"goal speed": (own.speed, 0), "goal acceleration": (own.acceleration, 0)}
+        gains = zip("PID", own.gains, self.settings.gains or own.paper, strict=True)
+        same |= {f"{name} gain": (span, value) for name, span, value in gains}
+        if own.bus_watchdog:
+            same["bus watchdog"] = own.bus_watchdog, min(127, math.ceil(deadline / 0.02))
+        return [
+            *(Order(n, span, dict.fromkeys(self.ids, value)) for n, (span, value) in same.items()),
+            Order("power limit", own.power_limit, self._power(1.0)),
+            Order("goal", own.goal, self._ticks(goals)),
+        ]
+
+    def _untaken(self, name: int, orders: Iterable[Order]) -> str | None:
+        """What of its orders a servo has not taken, in words; None where it has them all."""
+        first, length = self.registers.orders
+        block = self.read_one(name, self.registers.orders)
+        if block is None:
+            return "does not tell its goal"
+        for order in orders:
+            at, end = order.span[0] - first, order.span[0] - first + order.span[1]
+            if at >= 0 and end <= length:
+                told = int.from_bytes(block[at:end], "little")
+            else:
+                told = self.register(name, order.span)
+            wanted = order.values[name]
+            if told not in (wanted, None):  # it answered before: there is no such register
+                return f"has {order.name} {told} instead of {wanted}"
+        return None
 
     def soften(self, share: float) -> None:
         """Limit the servos' power to a share of what they have."""
         for _ in range(WRITES):
-            self.send_all(self.registers.power_limit, round(share * self.registers.full_power))
+            self.send(self.registers.power_limit, self._power(share))
+
+    def _power(self, share: float) -> dict[int, int]:
+        """Power limits, by id."""
+        return {name: round(share * most) for name, most in self._most.items()}
 
     def alarm(self, name: int) -> str:
         """Why a servo complains, in words."""
@@ -266,7 +310,7 @@ class Bus(Line):
             if self._plausible.believes(name, status.position, time.monotonic()):
                 found[name] = status
 
-    def _power(self, board: int) -> None:
+    def _switch_on(self, board: int) -> None:
         """Let the board, which speaks Protocol 1.0 whatever the servos speak, give them current."""
         packets = PacketHandler(1.0)
         with self._told():

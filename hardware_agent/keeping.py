@@ -14,9 +14,12 @@ class Kept:
 
     Attributes:
       limits: least and largest goal, ticks; beyond them it stays where it is.
+      power: largest duty, in the units of the power limit; it refuses more or, with Protocol 1.0,
+        begins with it when current comes.
     """
 
     limits: tuple[int, int]
+    power: int
 
 
 def put_right(line: Line, name: int) -> list[str]:
@@ -78,4 +81,4 @@ def kept(line: Line, name: int) -> Kept:
             f"{where} takes no angles, as its angle limits are {least} and {largest}; set "
             "joint mode, such as limits 0 and 4095, with ROBOTIS' tools"
         )
-    return Kept((least, largest))
+    return Kept((least, largest), line.sure(name, own.own_power))

@@ -13,6 +13,8 @@ from hardware_agent.registers import REGISTERS, Span
 PAUSE = 0.02  # s after a silence: an answer says not to which question, and may only be late
 REFUSAL = {1: 0x58, 2: 0x7F}
 """Bits of a status packet's error byte, by protocol, that say that nothing was done."""
+ABSENT = 0x08
+"""That of 1.0 which says that there is no such register; 2.0 never has it."""
 
 
 class Line:
@@ -127,6 +129,8 @@ class Line:
         refusal = REFUSAL[int(packets.getProtocolVersion())]
         for _ in range(self.settings.tries):
             data, result, error = packets.readTxRx(self._use(), name, *span)
+            if result == COMM_SUCCESS and error & ABSENT:
+                return None
             if result == COMM_SUCCESS and len(data) == span[1] and not error & refusal:
                 return bytes(data)
             time.sleep(PAUSE)

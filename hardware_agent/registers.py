@@ -50,13 +50,16 @@ class Registers:
       torque_enable: 1 holds, 0 is limp.
       gains: of P, I and D.
       speed: of the goal's motion; 0 for no limit.
+      acceleration: likewise; old firmware for 1.0 has none.
       goal: position, ticks.
       paper: P, I and D of the paper, Kp 4 and Kd 0.064, in the units of this firmware.
       power_limit: largest duty.
-      full_power: value of it that limits nothing.
+      own_power: EEPROM; the largest value of it that the servo allows itself.
+      full_power: value of both that limits nothing.
       bus_watchdog: 20 ms without an instruction after which the servo stops; None without one.
       hardware_error: bits of what shut the servo down; None where the status packet tells them.
       position: of the encoder.
+      orders: what a servo is told before it holds, but the acceleration of 1.0.
       block: everything a tick wants to know, position included.
     """
 
@@ -70,12 +73,15 @@ class Registers:
     gains: tuple[Span, Span, Span]
     paper: tuple[int, ...]
     speed: Span
+    acceleration: Span
     goal: Span
     power_limit: Span
+    own_power: Span
     full_power: int
     bus_watchdog: Span | None
     hardware_error: Span | None
     position: Span
+    orders: Span
     block: Span
 
     def status(self, data: bytes, error: int, detailed: bool, mounting: Mounting) -> Status:
@@ -123,12 +129,15 @@ REGISTERS = {
         gains=((28, 1), (27, 1), (26, 1)),
         paper=(32, 0, 16),
         speed=(32, 2),
+        acceleration=(73, 1),
         goal=(30, 2),
         power_limit=(34, 2),
+        own_power=(14, 2),
         full_power=1023,
         bus_watchdog=None,
         hardware_error=None,
         position=(36, 2),
+        orders=(26, 10),
         block=(36, 8),
     ),
     2: Registers(
@@ -142,12 +151,15 @@ REGISTERS = {
         gains=((84, 2), (82, 2), (80, 2)),
         paper=(512, 0, 1),
         speed=(112, 4),
+        acceleration=(108, 4),
         goal=(116, 4),
         power_limit=(100, 2),
+        own_power=(36, 2),
         full_power=885,
         bus_watchdog=(98, 1),
         hardware_error=(70, 1),
         position=(132, 4),
+        orders=(80, 40),
         block=(126, 21),
     ),
 }

@@ -1,29 +1,21 @@
 """What servos hold on to: a watchdog that has bitten, limits of their own, gains and speeds."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from agents import CONFIG, DARWIN
 from test_agent_mounting import FACTORY, HEAD, IDS, robot_with
 
 from hardware_agent.body import Body
-from hardware_agent.bus import Bus
-from hardware_agent.config import BusSettings, Settings
+from hardware_agent.config import Settings
+from hardware_agent.registers import REGISTERS, Span
 from hardware_agent.senses import Response, Senses
 from hardware_agent.virtual.robot import VirtualRobot
+from hardware_agent.virtual.tables import MX28_1
 
 pytest.importorskip("mujoco")
-
-
-def bus_of(folder: Path, protocol: int) -> Bus:
-    settings = BusSettings(str(folder / "bus"), protocol=protocol, board=200, timeout=0.3)
-    return Bus(settings, IDS)
-
-
-def pose_of(bus: Bus) -> np.ndarray:
-    answers = bus.read().servos
-    return np.array([answers[name].position for name in IDS])
 
 
 def body_of(folder: Path, protocol: int) -> Body:
@@ -50,6 +42,7 @@ def test_a_watchdog_that_has_bitten_keeps_no_servo_at_the_power_of_a_fallen_robo
         body.open()
         assert body.enable(sensed(body)) is None and powers(robot) == {1.0}
         body.make_safe(Response.SOFT, sensed(body), 1.0)
+        body.bus.read()  # once this is answered, what was written has arrived
         assert powers(robot) == {177 / 885}
         body.close()
         for servo in robot.servos:
@@ -57,6 +50,31 @@ def test_a_watchdog_that_has_bitten_keeps_no_servo_at_the_power_of_a_fallen_robo
         body.open()
         assert body.enable(sensed(body)) is None
         assert powers(robot) == {1.0}
+        body.close()
+
+
+KEPT = {1: "max_torque", 2: "pwm_limit"}
+POWER = {1: "torque_limit", 2: "goal_pwm"}
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_a_servo_keeps_the_power_limit_of_its_own(tmp_path: Path, protocol: int) -> None:
+    """Somebody spares a gear with it: it is neither overwritten nor asked for in vain."""
+    with robot_with(tmp_path, FACTORY, protocol) as robot:
+        memory, full = robot.servos[HEAD].memory, {1: 1023, 2: 885}[protocol]
+        memory.put(KEPT[protocol], round(0.6 * full))
+        body = body_of(tmp_path, protocol)
+        told = [line for line in body.open() if "power" in line]
+        assert told == [f"servo {IDS[HEAD]} gives head_tilt 60% of its power at most"]
+        assert body.enable(sensed(body)) is None
+        assert memory.get(POWER[protocol]) == round(0.6 * full)
+        body.make_safe(Response.SOFT, sensed(body), 1.0)
+        body.bus.read()  # once this is answered, what was written has arrived
+        assert memory.get(POWER[protocol]) == pytest.approx(0.12 * full, abs=1)
+        body.full_power()
+        body.bus.read()
+        assert memory.get(POWER[protocol]) == round(0.6 * full)
+        assert robot.servos[0].memory.get(POWER[protocol]) == full
         body.close()
 
 
@@ -70,4 +88,49 @@ def test_a_servo_that_keeps_its_power_limit_is_named_and_nothing_holds(tmp_path:
         refused = body.enable(sensed(body))
         assert str(refused) == ("enable: not taken: head_tilt has power limit 177 instead of 885")
         assert not any(s.memory.get("torque_enable") for s in robot.servos)
+        body.close()
+
+
+LEFT = {1: ("goal_acceleration", "d_gain", 26), 2: ("profile_acceleration", "position_d_gain", 80)}
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+@pytest.mark.parametrize("lost", [1, 2])
+def test_gains_and_speeds_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int) -> None:
+    """Another program has left its own; noise spoils one packet with the D gain, or both."""
+    acceleration, gain, address = LEFT[protocol]
+    with robot_with(tmp_path, FACTORY, protocol) as robot:
+        body = body_of(tmp_path, protocol)
+        body.open()
+        for servo in robot.servos:
+            servo.memory.put(acceleration, 10)
+            servo.memory.put(gain, 99)
+        left, send = [lost], body.bus.send
+
+        def noisy(span: Span, values: Mapping[int, int]) -> None:
+            if span[0] == address and left[0]:
+                left[0] -= 1
+            else:
+                send(span, values)
+
+        body.bus.send = noisy  # type: ignore[method-assign]
+        refused = body.enable(sensed(body))
+        if lost == 2:
+            wanted = REGISTERS[protocol].paper[2]
+            assert f"l_sho_pitch has D gain 99 instead of {wanted}, " in str(refused)
+            assert str(refused).endswith(" and 17 more")
+            assert not any(s.memory.get("torque_enable") for s in robot.servos)
+        else:
+            assert refused is None
+            assert {s.memory.get(acceleration) for s in robot.servos} == {0}
+        body.close()
+
+
+def test_old_firmware_has_no_acceleration(tmp_path: Path) -> None:
+    with robot_with(tmp_path, FACTORY) as robot:
+        old = replace(MX28_1, size=52, registers=MX28_1.registers[:-1])
+        robot.servos[HEAD].memory.table = old
+        body = body_of(tmp_path, 1)
+        body.open()
+        assert body.enable(sensed(body)) is None
         body.close()

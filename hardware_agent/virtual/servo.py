@@ -247,6 +247,13 @@ class Servo2(Servo):
         """The EEPROM is locked while torque is on."""
         return bool(self.memory.get("torque_enable"))
 
+    def restart(self) -> None:
+        """As any servo; the duty that may be used starts as the EEPROM says."""
+        super().restart()
+        most = self.memory.get("pwm_limit")
+        self.memory.put("goal_pwm", most)
+        self._order("limit", most / self.FULL)
+
     def hears(self, protocol: int, baud: int | None) -> bool:
         """As any device; the watchdog counts from here."""
         heard = super().hears(protocol, baud)
