@@ -186,9 +186,9 @@ class Bus(Line):
     def _orders(self, goals: Sequence[float] | Array, deadline: float) -> list[Order]:
         """What servos shall have in their registers before they hold, the goal last."""
         own = self.registers
-        same = {"goal speed": (own.speed, 0), "goal acceleration": (own.acceleration, 0)}
         gains = zip("PID", own.gains, self.settings.gains or own.paper, strict=True)
-        same |= {f"{name} gain": (span, value) for name, span, value in gains}
+        same = {f"{name} gain": (span, value) for name, span, value in gains}
+        same["goal speed"] = own.speed, 0
         if own.bus_watchdog:
             same["bus watchdog"] = own.bus_watchdog, min(127, math.ceil(deadline / 0.02))
         return [
@@ -199,18 +199,15 @@ class Bus(Line):
 
     def _untaken(self, name: int, orders: Iterable[Order]) -> str | None:
         """What of its orders a servo has not taken, in words; None where it has them all."""
-        first, length = self.registers.orders
+        first, _ = self.registers.orders
         block = self.read_one(name, self.registers.orders)
         if block is None:
             return "does not tell its goal"
         for order in orders:
-            at, end = order.span[0] - first, order.span[0] - first + order.span[1]
-            if at >= 0 and end <= length:
-                told = int.from_bytes(block[at:end], "little")
-            else:
-                told = self.register(name, order.span)
+            address, length = order.span
+            told = int.from_bytes(block[address - first :][:length], "little")
             wanted = order.values[name]
-            if told not in (wanted, None):  # it answered before: there is no such register
+            if told != wanted:
                 return f"has {order.name} {told} instead of {wanted}"
         return None
 

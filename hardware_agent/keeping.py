@@ -1,4 +1,4 @@
-"""What a servo keeps without current: what of it the agent puts right, and what it leaves."""
+"""What a servo keeps while nobody tells it anything: what of it is put right, and what is left."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class Kept:
 
 
 def put_right(line: Line, name: int) -> list[str]:
-    """Put a limp servo's lasting settings right.
+    """Put right what a limp servo has kept, and is not told whenever it shall hold.
 
     Args:
       line: to the servo, open and owned.
@@ -47,9 +47,11 @@ def put_right(line: Line, name: int) -> list[str]:
     for told, span, wanted in (
         ("return delay", own.return_delay, 0),
         ("status return level", own.status_level, 2),
+        ("goal acceleration", own.acceleration, 0),
     ):
         known = line.register(name, span)
-        if known != wanted:
+        absent = known is None and span == own.acceleration
+        if known != wanted and not absent:
             line.put(name, span, wanted)
             if line.register(name, span) != wanted:
                 raise BusError(f"{where} keeps {told} {known}")

@@ -59,7 +59,7 @@ class Registers:
       bus_watchdog: 20 ms without an instruction after which the servo stops; None without one.
       hardware_error: bits of what shut the servo down; None where the status packet tells them.
       position: of the encoder.
-      orders: what a servo is told before it holds, but the acceleration of 1.0.
+      orders: from the first to the last of what a servo is told before it holds.
       block: everything a tick wants to know, position included.
     """
 

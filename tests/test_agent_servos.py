@@ -91,19 +91,19 @@ def test_a_servo_that_keeps_its_power_limit_is_named_and_nothing_holds(tmp_path:
         body.close()
 
 
-LEFT = {1: ("goal_acceleration", "d_gain", 26), 2: ("profile_acceleration", "position_d_gain", 80)}
+LEFT = {1: ("d_gain", 26), 2: ("position_d_gain", 80)}
+ACCELERATION = {1: "goal_acceleration", 2: "profile_acceleration"}
 
 
 @pytest.mark.parametrize("protocol", [1, 2])
 @pytest.mark.parametrize("lost", [1, 2])
-def test_gains_and_speeds_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int) -> None:
-    """Another program has left its own; noise spoils one packet with the D gain, or both."""
-    acceleration, gain, address = LEFT[protocol]
+def test_gains_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int) -> None:
+    """Another program left its own; noise spoils one packet with the D gain, or both."""
+    gain, address = LEFT[protocol]
     with robot_with(tmp_path, FACTORY, protocol) as robot:
         body = body_of(tmp_path, protocol)
         body.open()
         for servo in robot.servos:
-            servo.memory.put(acceleration, 10)
             servo.memory.put(gain, 99)
         left, send = [lost], body.bus.send
 
@@ -122,7 +122,19 @@ def test_gains_and_speeds_arrive_or_nothing_holds(tmp_path: Path, protocol: int,
             assert not any(s.memory.get("torque_enable") for s in robot.servos)
         else:
             assert refused is None
-            assert {s.memory.get(acceleration) for s in robot.servos} == {0}
+        body.close()
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_an_acceleration_that_another_program_left_is_taken_back(
+    tmp_path: Path, protocol: int
+) -> None:
+    with robot_with(tmp_path, FACTORY, protocol) as robot:
+        robot.servos[HEAD].memory.put(ACCELERATION[protocol], 10)
+        body = body_of(tmp_path, protocol)
+        told = [line for line in body.open() if "acceleration" in line]
+        assert told == [f"servo {IDS[HEAD]}: goal acceleration 10 made 0"]
+        assert robot.servos[HEAD].memory.get(ACCELERATION[protocol]) == 0
         body.close()
 
 
