@@ -130,8 +130,9 @@ def test_an_acceleration_that_another_program_left_is_taken_back(
     tmp_path: Path, protocol: int
 ) -> None:
     with robot_with(tmp_path, FACTORY, protocol) as robot:
-        robot.servos[HEAD].memory.put(ACCELERATION[protocol], 10)
         body = body_of(tmp_path, protocol)
+        body.open()  # which gives servos current
+        robot.servos[HEAD].memory.put(ACCELERATION[protocol], 10)
         told = [line for line in body.open() if "acceleration" in line]
         assert told == [f"servo {IDS[HEAD]}: goal acceleration 10 made 0"]
         assert robot.servos[HEAD].memory.get(ACCELERATION[protocol]) == 0
