@@ -11,7 +11,8 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from hardware_agent.mounting import LAST, Mounting
+from hardware_agent.mounting import Mounting
+from hardware_agent.ranges import VOLTAGE, check
 from pup.errors import InputError
 from pup.robot_toml import Table, read_text
 
@@ -272,35 +273,6 @@ PARTS: dict[str, type[Any]] = {
     "distance": DistanceSettings,
     "link": LinkSettings,
 }
-CHOICES: Mapping[tuple[str, str], tuple[object, ...]] = {
-    ("BusSettings", "protocol"): (1, 2),
-    ("BusSettings", "read"): ("bulk", "sync"),
-    ("BusSettings", "write"): ("sync", "bulk"),
-    ("BusSettings", "detail"): ("all", "rotating"),
-    ("Mounting", "sign"): (1, -1),
-    ("ImuSettings", "kind"): ("bno055-uart", "bno055-i2c", "cm740", "none"),
-    ("ControlSettings", "clock"): ("wall", "lockstep"),
-    ("ControlSettings", "gate"): ("operator", "auto"),
-    ("ControlSettings", "source"): ("hardware", "simulation"),
-    ("DistanceSettings", "kind"): ("operator", "hook", "virtual"),
-}
-LIMITS: Mapping[tuple[str, str], tuple[float, float]] = {
-    ("BusSettings", "timeout"): (0.0005, 1.0),
-    ("BusSettings", "tries"): (1, 10),
-    ("BusSettings", "board"): (0, 252),
-    ("Mounting", "zero"): (0, LAST),
-    ("ImuSettings", "timeout"): (0.0005, 1.0),
-    ("ControlSettings", "rate"): (5.0, 500.0),
-    ("ControlSettings", "ramp"): (0.5, 60.0),
-    ("ControlSettings", "settle"): (0.0, 60.0),
-    ("ControlSettings", "patience"): (0.1, 3600.0),
-    ("SafetySettings", "speed"): (0.1, 100.0),
-    ("SafetySettings", "fallen_power"): (0.0, 1.0),
-    ("SafetySettings", "temperature"): (20.0, 80.0),
-    ("WatchdogSettings", "timeout"): (0.05, 10.0),
-    ("LinkSettings", "heartbeat"): (0.05, 60.0),
-    ("LinkSettings", "liveness"): (1.0, 100.0),
-}
 
 
 def _path(table: Table, key: str, file: Path) -> Path:
@@ -316,7 +288,7 @@ def _part(table: Table, kind: type[Any]) -> Any:
     for f in fields(kind):
         if table.has(f.name) or (f.name == "port" and kind is BusSettings):
             value = _value(table, f.name, hints[f.name])
-            _check(table, kind, f.name, value)
+            check(table, kind.__name__, f.name, value)
             read[f.name] = value
     table.close()
     part = kind(**read)
@@ -346,17 +318,6 @@ def _value(table: Table, key: str, hint: Any) -> Any:
     return tuple(map(int, values)) if get_args(hint)[0] is int else values
 
 
-def _check(table: Table, kind: type[Any], key: str, value: Any) -> None:
-    choices = CHOICES.get((kind.__name__, key))
-    if choices is not None and value not in choices:
-        told = ", ".join(repr(c) for c in choices)
-        raise table.mistake(key, f"{value!r}; use one of {told}")
-    if choices is None and type(value) in (int, float):
-        low, high = LIMITS.get((kind.__name__, key), (1e-6, 1e9))
-        if not low <= value <= high:
-            raise table.mistake(key, f"{value:g} is outside [{low:g}, {high:g}]")
-
-
 def _mistakes(part: Any) -> Any:
     """What does not go together."""
     if isinstance(part, BusSettings):
@@ -381,10 +342,15 @@ def _mistakes(part: Any) -> Any:
         # An even order of the axes goes with an even number of minuses.
         elif ("".join(a[-1] for a in part.axes) in "xyzxy") == "".join(part.axes).count("-") % 2:
             yield "axes", "is a mirror image, which no mounting gives; check the signs"
+    if isinstance(part, ControlSettings) and (part.clock, part.source) == ("lockstep", "hardware"):
+        yield (
+            "clock",
+            'a real robot\'s time does not stand still; "lockstep" needs source = "simulation"',
+        )
     if isinstance(part, SafetySettings) and (
-        len(part.voltage) != 2 or not part.voltage[0] < part.voltage[1]
+        len(part.voltage) != 2 or not VOLTAGE[0] <= part.voltage[0] < part.voltage[1] <= VOLTAGE[1]
     ):
-        yield "voltage", "write [least, largest]"
+        yield "voltage", f"write [least, largest], from {VOLTAGE[0]:g} to {VOLTAGE[1]:g} V"
     if isinstance(part, DistanceSettings):
         if part.kind == "hook" and not part.command:
             yield "command", "missing; which command measures the distance?"

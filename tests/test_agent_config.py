@@ -1,12 +1,13 @@
 """`agent.toml`: every mistake is told in one line, and `pup-agent` exits with 2."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from agents import CONFIG, changed
 
 from hardware_agent.cli import main
-from hardware_agent.config import Settings
+from hardware_agent.config import SafetySettings, Settings
 from pup.errors import InputError
 
 WHOLE = CONFIG.format(folder="/tmp/nowhere", protocol=1, clock="wall")
@@ -23,6 +24,13 @@ def test_a_configuration_is_read_and_the_rest_has_defaults(tmp_path: Path) -> No
     assert settings.bus.baud == 1_000_000 and settings.bus.gains is None
     assert settings.state == tmp_path / "state"
     assert settings.control.rate == 33.0 and settings.safety.temperature == 70.0
+
+
+def test_defaults_may_be_written_down(tmp_path: Path) -> None:
+    """None of them is beyond its range."""
+    told = {f.name: f.default for f in fields(SafetySettings) if f.default is not None}
+    text = "".join(f"{key} = {list(v) if isinstance(v, tuple) else v}\n" for key, v in told.items())
+    assert read(tmp_path, changed(WHOLE, f"[safety]\n{text}")).safety == SafetySettings()
 
 
 MISTAKES = {
@@ -57,6 +65,16 @@ MISTAKES = {
     "a text for true": ('[control]\nrealtime = "no"', "control.realtime: expected true or false"),
     "a limit too hot": ("[safety]\ntemperature = 95", "safety.temperature: 95 is outside"),
     "no voltage": ("[safety]\nvoltage = [15, 9]", "safety.voltage: write [least, largest]"),
+    "a voltage in mV": ("[safety]\nvoltage = [9500, 15000]", "largest], from 5 to 20 V"),
+    "an age in ms": ("[safety]\nstale = 20", "safety.stale: 20 is outside [0.001, 1]"),
+    "a delay in ms": ("[safety]\nlate = 150", "safety.late: 150 is outside [0.001, 2]"),
+    "a tilt in degrees": ("[safety]\nfall_tilt = 60", "safety.fall_tilt: 60 is outside [0.1, 1.6]"),
+    "a lean in degrees": ("[control]\nupright = 15", "control.upright: 15 is outside [0.01, 1.6]"),
+    "all of the current": ("[safety]\ncurrent = 1.0", "safety.current: 1 is outside [0.01, 0.95]"),
+    "a time that stands still": (
+        '[control]\nclock = "lockstep"\nsource = "hardware"',
+        'control.clock: a real robot\'s time does not stand still; "lockstep" needs source',
+    ),
     "no hook": ('[distance]\nkind = "hook"', "distance.command: missing"),
     "a gateway without keys": ('[link]\ngateway = "tcp://a:1"', "link.key: missing"),
     "an odd gateway": (
