@@ -21,7 +21,7 @@ from pup.robot import RobotDescription
 Array = NDArray[np.float64]
 
 TILT = 1.0  # rad, of a robot without a gait
-SILENT = 1.0  # s, after which an IMU is set up anew while the robot is limp
+SILENT = 1.0  # s, after which an IMU or all servos are seen to while the robot is limp
 MISSED = 0.01  # rad of a joint's range that nobody misses
 DOUBT = 2.0  # s, from which on a servo that does not say that it is limp is a problem
 
@@ -81,7 +81,7 @@ class Body:
         }
         self._seen = np.full(n, -math.inf)
         self._imu: Orientation | None = None
-        self._imu_seen = self._mended = self._sensed = -math.inf
+        self._imu_seen = self._mended = self._sensed = self._lit = -math.inf
         self._written = -math.inf
         self.goal = np.full(n, math.nan)
         self._doubt()
@@ -280,6 +280,19 @@ class Body:
         if senses.time - max(senses.imu_seen, self._mended) > SILENT:
             self._mended = senses.time
             self.imu.configure()
+
+    def dark(self, senses: Senses) -> bool:
+        """Whether the servos of a limp robot have no current, for the board was reset.
+
+        Opening the body anew switches it on. The board is asked where all servos are silent.
+
+        Raises:
+          BusError: the bus is gone.
+        """
+        if senses.time - max(float(senses.seen.max()), self._lit) <= SILENT:
+            return False
+        self._lit = senses.time
+        return self.bus.dark()
 
     def limp(self) -> bool:
         """Torque off; False when the bus does not take it.

@@ -232,6 +232,11 @@ class Bus(Line):
         told = self.register(name, self.registers.torque_enable)
         return None if told is None else bool(told)
 
+    def dark(self) -> bool:
+        """Whether the board says that it gives the servos no current, as after a reset of it."""
+        board = self.settings.board
+        return bool(board) and self._current(board) not in (ON, None)
+
     def _ticks(self, goals: Iterable[float]) -> dict[int, int]:
         """Goals of joints, rad, as the servos are told them, by id."""
         each = zip(self.ids, goals, strict=True)
@@ -308,12 +313,16 @@ class Bus(Line):
                 found[name] = status
 
     def _switch_on(self, board: int) -> None:
-        """Let the board, which speaks Protocol 1.0 whatever the servos speak, give them current."""
-        packets = PacketHandler(1.0)
+        """Let the board give the servos current."""
+        power = self._current(board)
+        if power is None:
+            raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
+        if power != ON:
+            with self._told():
+                PacketHandler(1.0).writeTxRx(self._use(), board, *BOARD_POWER, list(ON))
+            time.sleep(POWER_UP)
+
+    def _current(self, board: int) -> bytes | None:
+        """What the board, which speaks Protocol 1.0 whatever the servos speak, tells of it."""
         with self._told():
-            power = self._ask_one(packets, board, BOARD_POWER)
-            if power is None:
-                raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
-            if power != ON:
-                packets.writeTxRx(self._use(), board, *BOARD_POWER, list(ON))
-                time.sleep(POWER_UP)
+            return self._ask_one(PacketHandler(1.0), board, BOARD_POWER)

@@ -151,6 +151,7 @@ class Motion(Loop):
                 self._body.guard.rest(senses)
                 self._body.confirm_limp(senses)
                 self._body.mend(senses)
+                self._bus = not self._body.dark(senses)  # without current: opened anew next time
             self._serve(senses)
         except BusError as error:
             self._bus = False

@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
-from agents import CONFIG, DARWIN
+from agents import CONFIG, DARWIN, Lab, wait
 from test_agent_mounting import FACTORY, HEAD, IDS, robot_with
 
 from hardware_agent.body import Body
@@ -147,3 +148,22 @@ def test_old_firmware_has_no_acceleration(tmp_path: Path) -> None:
         body.open()
         assert body.enable(sensed(body)) is None
         body.close()
+
+
+def test_servos_whose_board_was_reset_get_their_current_back(tmp_path: Path) -> None:
+    """By the agent, which nobody has to start again."""
+    with robot_with(tmp_path, FACTORY) as robot:
+        body_of(tmp_path, 1)
+        made = Lab(tmp_path, cast(Any, None))  # the robot lives in this process
+        try:
+            made.start()
+            made.side(cmd="reset", hold="rope")
+            wait(lambda: "position" in made.health(), 20, made.log)
+            made.say("enable")
+            robot.board.restart()
+            assert "did not answer" in made.until("fault")["reason"]
+            wait(lambda: all(servo.supplied for servo in robot.servos), 20, made.log)
+            wait(lambda: made.health()["bus"]["works"] and made.health()["limp"], 20, made.log)
+            assert made.say("enable")["state"] == "enabled"
+        finally:
+            made.end()
