@@ -7,14 +7,12 @@ commands of this computer, trials, systemd.
 
 import logging
 import queue
-import subprocess
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from shutil import which
 from typing import Any
 
 from hardware_agent.activities import Event, Played, Ready
@@ -33,6 +31,7 @@ from hardware_agent.port import BusError, BusyError
 from hardware_agent.recordings import Recordings
 from hardware_agent.scripts import Scripts
 from hardware_agent.status import brief
+from hardware_agent.stopper import Stopper
 from hardware_agent.systemd import notify
 from hardware_agent.trials import TrialBook
 from hardware_agent.warmth import Warmth
@@ -111,7 +110,7 @@ class Agent:
         if settings.link.gateway:
             self._link = LinkThread(Link(settings.link, self._meet), self._hear)
         self._control = ControlServer(settings.socket, self.answer)
-        self._stopper: subprocess.Popen[bytes] | None = None
+        self._stopper = Stopper(settings.stop.command, self._pressed)
         self._ending = False
         self._beaten = self._resent = 0.0
         self._seen: tuple[AgentState, bool] | None = None
@@ -283,7 +282,7 @@ class Agent:
         if do in MOVING and stopped():
             raise InputError(LATE.reason)
         if do == "enable":
-            self._watch_stop()
+            self._stopper.watch()
             refused = self._motion.enable(stopped)
         elif do == "disable":
             refused = self._motion.disable()
@@ -324,26 +323,8 @@ class Agent:
         else:
             raise InputError(f"{do!r} is no command of this agent")
 
-    def _watch_stop(self) -> None:
-        """Start the command that waits for the emergency stop, if there is one.
-
-        A thread of its own waits for its end, for this loop writes files. The command ends with an
-        agent that is killed, where setpriv is there: it may own a line that the next one needs.
-        """
-        command = self._settings.stop.command
-        if not command or (self._stopper is not None and self._stopper.poll() is None):
-            return
-        if which(command[0]) is None:
-            raise InputError(f"stop.command: {command[0]}: no such program")
-        bound = ("setpriv", "--pdeathsig", "KILL") if which("setpriv") else ()
-        try:
-            self._stopper = subprocess.Popen([*bound, *command], stdin=subprocess.DEVNULL)
-        except OSError as error:
-            raise InputError(f"stop.command: {command[0]}: {error.strerror}") from error
-        threading.Thread(target=self._stop_after, args=(self._stopper,), daemon=True).start()
-
-    def _stop_after(self, stopper: "subprocess.Popen[bytes]") -> None:
-        stopper.wait()
+    def _pressed(self) -> None:
+        """The command of the emergency stop has ended."""
         if not self._ending:
             self._stop("the emergency stop's command has ended")
 
@@ -396,8 +377,7 @@ class Agent:
         notify("STOPPING=1")
         self._motion.close()
         self._watchdog.close()
-        if self._stopper is not None:
-            self._stopper.terminate()
+        self._stopper.close()
         self._control.close()
         self._conductor.close()
         if self._link is not None:

@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 from agents import CONFIG, lab, wait
+from test_agent_holds import enabled
 
 from hardware_agent import stopping
 from hardware_agent.cli import main
 from hardware_agent.control import ControlServer
+from pup.errors import InputError
 
 WHOLE = CONFIG.format(folder="/tmp/nowhere", protocol=1, clock="wall")
 MISTAKES = {
@@ -92,3 +94,20 @@ def test_without_an_agent_it_takes_the_bus(
         wait(lambda: not (tmp_path / "bus").exists(), 10)
         assert main(["stop", "--config", str(made.config)]) == 1
         assert "no servo was told anything" in said(capsys)
+
+
+def test_a_switch_that_is_pressed_keeps_the_robot_from_being_enabled(tmp_path: Path) -> None:
+    """A latched one gives no edge to wait for: the command looks at its level first."""
+    pytest.importorskip("mujoco")
+    released = tmp_path / "released"
+    script = f"while test -e {released}; do sleep 0.05; done"
+    with lab(tmp_path, more=f'[stop]\ncommand = ["sh", "-c", "{script}"]\n') as made:
+        made.start()
+        for _ in range(2):
+            with pytest.raises(InputError, match="ended at once, with 0; release the emergency"):
+                made.say("enable")
+        assert made.side(cmd="bus")["holding"] == 0
+        released.touch()
+        enabled(made)
+        released.unlink()
+        assert "command has ended" in made.until("stopped")["reason"]
