@@ -109,12 +109,19 @@ def test_a_delayed_command_and_a_delayed_reading_cannot_be_told_apart() -> None:
         assert np.abs(one[name].position - two[name].position).max() < 2e-4
 
 
-def test_a_joint_may_have_play_and_give_way_besides() -> None:
+@pytest.mark.parametrize("share", [1.0, 0.1])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("joint_compliance", "joint"), ("structural_flex", "body")]
+)
+def test_a_joint_may_have_play_and_give_way_besides(name: str, kind: str, share: float) -> None:
     """Both are joints in series: as a pair, or as a nuisance of one another."""
     world = world_of("servo_bench")
-    kit, rng = Kit.of(world.robot, False), np.random.default_rng(0)
-    play, give = (draw(name, kit, rng, ("joint",)) for name in ("backlash", "joint_compliance"))
-    alone = readings(replace(world, effects=(give,)), plans(world.robot, "bench"))[0]
-    both = readings(replace(world, effects=(play, give)), plans(world.robot, "bench"))[0]
-    apart = [both[name].stacked() - alone[name].stacked() for name in both]
-    assert np.sqrt(np.mean(np.concatenate(apart) ** 2)) > SEEN
+    kit = Kit.of(world.robot, False)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        play = draw("backlash", kit, rng, ("joint",))
+        give = draw(name, kit, rng, (kind,)).scaled(share)
+        alone = readings(replace(world, effects=(give,)), plans(world.robot, "bench"))[0]
+        both = readings(replace(world, effects=(play, give)), plans(world.robot, "bench"))[0]
+        apart = np.concatenate([both[plan].stacked() - alone[plan].stacked() for plan in both])
+        assert SEEN < np.sqrt(np.mean(apart**2)) < 6 * play.size

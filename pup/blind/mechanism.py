@@ -20,6 +20,7 @@ TEETH = (0.002, 1.0)  # s and damping ratio of gear teeth that meet
 HARD = (0.98, 0.995, 0.001, 0.5, 2.0)  # teeth hardly give way: play that is nil is none
 STICKY = (0.99, 0.9995, 0.001, 0.5, 2.0)  # dry friction hardly creeps
 FIRM = (0.002, 1.0)
+BETWEEN = 0.1  # of the rotor's inertia, what lies between parts in series
 LEAST = 0.05  # of friction or damping that is left of a contact
 ON_GROUND = ("ground_compliance", "ground_slope", "ground_friction", "contact_restitution")
 INTEGRATORS = {
@@ -106,6 +107,7 @@ def build(
 
 def _integrate(spec: mujoco.MjSpec, engine: Engine) -> None:
     spec.option.timestep = engine.step
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # what breaks down must show
     spec.option.integrator = INTEGRATORS[engine.integrator]
     spec.option.solver = SOLVERS[engine.solver]
     spec.option.cone = CONES[engine.cone]
@@ -150,13 +152,16 @@ def _equip(world: World, spec: mujoco.MjSpec, effect: Effect, support: str) -> N
 
 
 def _second(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, effect: Effect) -> mujoco.MjsJoint:
-    """A joint of the same axis in series; one may have play and give way, too."""
+    """A joint of the same axis in series; one may have play and give way, too.
+
+    It has an inertia of its own: with nothing between two of them their equations are singular.
+    """
     return joint.parent.add_joint(
         name=f"{joint.name}:{effect.name}",
         type=mujoco.mjtJoint.mjJNT_HINGE,
         axis=tuple(joint.axis),
         pos=tuple(joint.pos),
-        armature=0.0,
+        armature=BETWEEN * joint.armature,
         frictionloss=0.0,
     )
 
