@@ -51,6 +51,10 @@ class Stage(StrEnum):
     MEASURING = "measuring"
 
 
+MOVED = (Stage.POSING, Stage.PLACING, Stage.SETTLING, Stage.RUNNING)
+"""Stages in which a trial moves the robot, or is about to."""
+
+
 class Conductor:
     """Runs the trials of a book, in the agent's main thread.
 

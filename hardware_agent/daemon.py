@@ -17,7 +17,7 @@ from typing import Any
 
 from hardware_agent.activities import Event, Played, Ready
 from hardware_agent.body import Body as RobotBody
-from hardware_agent.conductor import Conductor, Stage
+from hardware_agent.conductor import MOVED, Conductor, Stage
 from hardware_agent.config import Settings
 from hardware_agent.control import ControlServer
 from hardware_agent.distance import distance_of
@@ -109,7 +109,7 @@ class Agent:
         self._link: LinkThread | None = None
         if settings.link.gateway:
             self._link = LinkThread(Link(settings.link, self._meet), self._hear)
-        self._control = ControlServer(settings.socket, self.answer)
+        self._control = ControlServer(settings.socket, self.answer, self._left)
         self._stopper = Stopper(settings.stop.command, self._pressed)
         self._ending = False
         self._beaten = self._resent = 0.0
@@ -248,6 +248,12 @@ class Agent:
         """The emergency stop; what was asked before it is not done after it. From any thread."""
         self._stops += 1
         self._motion.stop(reason)
+
+    def _left(self) -> None:
+        """Whoever stood at the robot is gone: nobody could stop it any more. From any thread."""
+        moved = self._conductor.stage in MOVED or self._scripts.told["stage"]
+        if moved and not self._ending:
+            self._stop("the operator's terminal is gone")
 
     def _meet(self) -> None:
         """A connection has come about; from the link's thread."""

@@ -7,7 +7,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from hardware_agent.control import say
+from hardware_agent.control import Talk, attending
 from hardware_agent.prompt import ENTER, LOOK, LeftError, key_pressed, keys, leaving
 from pup.errors import InputError
 from pup.script import Script
@@ -26,7 +26,8 @@ def play(
 ) -> int:
     """Play scripts and tell where their recordings are.
 
-    A robot that moves when the terminal is lost is stopped: nobody could any more.
+    A robot that moves when the terminal is lost, or this process, is stopped: nobody could any
+    more.
 
     Args:
       socket: of the agent.
@@ -44,14 +45,14 @@ def play(
     if not auto and not sys.stdin.isatty():
         raise InputError("this is no terminal; --auto plays without questions")
     scripts = [Script.read(file) for file in files]
-    with _stopping(socket), nullcontext() if auto else keys():
+    with _attended(socket) as agent, nullcontext() if auto else keys():
         if not auto:
             print(HELP, flush=True)
         try:
             for script in scripts:
                 first: str | None = None
                 for _ in range(repeats):
-                    first = _one(socket, script, first, auto, setup) or first
+                    first = _one(agent, script, first, auto, setup) or first
         except _Ended as error:
             print(error, file=sys.stderr)
             return 1
@@ -59,21 +60,21 @@ def play(
 
 
 def _one(
-    socket: Path, script: Script, repeat_of: str | None, auto: bool, setup: Mapping[str, float]
+    agent: Talk, script: Script, repeat_of: str | None, auto: bool, setup: Mapping[str, float]
 ) -> str | None:
     """Play a script; the recording's id, None where it was skipped."""
     print(f"{script.id}: {script.motion}, {script.support}, {script.duration:.1f} s", flush=True)
-    if not auto and not _agreed(socket, moved=False):
+    if not auto and not _agreed(agent, moved=False):
         return None
     wanted = {"script": script.document(), "repeat_of": repeat_of, "setup": dict(setup)}
-    say(socket, {"do": "pose", "agreed": not auto, **wanted})
-    told = _until(socket, ("ready", ""), auto)
+    agent.say({"do": "pose", "agreed": not auto, **wanted})
+    told = _until(agent, ("ready", ""), auto)
     if told["stage"] == "ready":
         if not auto and script.support == "ground":
             print(GROUND, flush=True)
-            _agreed(socket, moved=True)
-        say(socket, {"do": "play", "agreed": not auto})
-        told = _until(socket, ("",), auto)
+            _agreed(agent, moved=True)
+        agent.say({"do": "play", "agreed": not auto})
+        told = _until(agent, ("",), auto)
     result = told["result"]
     if "recording" not in result:
         raise _Ended(f"{script.id}: {result.get('reason', 'it ended')}")
@@ -81,49 +82,48 @@ def _one(
     return Path(result["recording"]).stem
 
 
-def _agreed(socket: Path, moved: bool) -> bool:
+def _agreed(agent: Talk, moved: bool) -> bool:
     """Wait for ENTER; false where the script is to be skipped. Any other key stops the robot.
 
     Args:
-      socket: of the agent.
+      agent: that plays.
       moved: whether the robot is in the script's first pose by now, and no longer to be left.
     """
     while (key := key_pressed()) not in ENTER:
+        agent.say({"do": "health"})  # who is silent is taken for gone
         if key == "s" and not moved:
             return False
         if key == "q" and not moved:
             raise _Ended("left")
         if key:
-            _stop(socket)
+            _stop(agent)
     return True
 
 
-def _until(socket: Path, stages: Sequence[str], auto: bool) -> dict[str, Any]:
+def _until(agent: Talk, stages: Sequence[str], auto: bool) -> dict[str, Any]:
     """Wait for a stage; any key stops the robot meanwhile."""
     while True:
-        told: dict[str, Any] = say(socket, {"do": "health"})["script"]
+        told: dict[str, Any] = agent.say({"do": "health"})["script"]
         if told["stage"] in stages:
             return told
         if auto:
             time.sleep(LOOK)
         elif key_pressed():
-            _stop(socket)
+            _stop(agent)
 
 
-def _stop(socket: Path) -> None:
-    told = say(socket, {"do": "stop", "reason": "by the operator"})
+def _stop(agent: Talk) -> None:
+    told = agent.say({"do": "stop", "reason": "by the operator"})
     if not told["limp"]:
         raise _Ended("NOT EVERY SERVO SAYS THAT IT IS LIMP: use the power switch")
     raise _Ended(STOPPED)
 
 
 @contextmanager
-def _stopping(socket: Path) -> Iterator[None]:
-    """Stop a robot that moves by a script when whoever plays it is gone."""
+def _attended(socket: Path) -> Iterator[Talk]:
+    """A robot that moves by a script is stopped when whoever plays it is gone."""
     try:
-        with leaving():
-            yield
-    except (LeftError, OSError, KeyboardInterrupt) as error:
-        if say(socket, {"do": "health"})["script"]["stage"]:
-            say(socket, {"do": "stop", "reason": "the operator's terminal is gone"})
+        with leaving(), attending(socket) as agent:
+            yield agent
+    except (LeftError, OSError) as error:
         raise KeyboardInterrupt from error

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
-from hardware_agent.control import say
+from hardware_agent.control import Talk, attending
 from pup.errors import InputError
 
 LOOK = 0.2  # s between two looks at the agent
@@ -31,7 +31,8 @@ class LeftError(Exception):
 def operate(socket: Path) -> int:
     """Talk to the agent until the operator leaves.
 
-    A robot that moves when the terminal is lost is stopped: nobody could any more.
+    A robot that moves when the terminal is lost, or this process, is stopped: nobody could any
+    more.
 
     Args:
       socket: of the agent.
@@ -45,22 +46,20 @@ def operate(socket: Path) -> int:
     if not sys.stdin.isatty():
         raise InputError("this is no terminal; use `pup-agent arm`, `stop` and `distance`")
     try:
-        with leaving(), keys():
+        with leaving(), attending(socket) as agent, keys():
             print(HELP, flush=True)
-            while trial := _watch(socket):
-                _measure(socket, trial)
+            while trial := _watch(agent):
+                _measure(agent, trial)
         return 0
     except (LeftError, OSError):
-        if say(socket, {"do": "health"})["stage"] in MOVING:
-            say(socket, {"do": "stop", "reason": "the operator's terminal is gone"})
         return 1
 
 
-def _watch(socket: Path) -> str:
+def _watch(agent: Talk) -> str:
     """Show what happens and do what keys say; the trial whose distance to type, none to leave."""
     shown = ""
     while True:
-        told = say(socket, {"do": "health"})
+        told = agent.say({"do": "health"})
         asked = told["waiting"] if told["stage"] not in MOVING else ""
         line = f"{told['state']} {told['reason']} trial {told['trial']}: {told['stage']} {asked}"
         if line != shown:
@@ -74,17 +73,17 @@ def _watch(socket: Path) -> str:
         if key == "q":
             return ""
         if key:
-            _press(socket, key, asked)
+            _press(agent, key, asked)
 
 
-def _press(socket: Path, key: str, asked: str) -> None:
+def _press(agent: Talk, key: str, asked: str) -> None:
     """Do what a key means."""
     meaning = {"e": "enable", "d": "disable"}
     if asked == "arm":
         meaning |= dict.fromkeys(ENTER, "arm") | {"s": "skip"}
     do = meaning.get(key, "stop")
     try:
-        told = say(socket, {"do": do, "reason": "by the operator"})
+        told = agent.say({"do": do, "reason": "by the operator"})
     except InputError as error:
         print(error)
         return
@@ -92,13 +91,13 @@ def _press(socket: Path, key: str, asked: str) -> None:
         print("NOT EVERY SERVO SAYS THAT IT IS LIMP: use the power switch")
 
 
-def _measure(socket: Path, trial: str) -> None:
+def _measure(agent: Talk, trial: str) -> None:
     """Let a distance be typed; a key that is no part of one stops the robot, as ever."""
     print(ASKED, end="", flush=True)
     typed = ""
     while (key := key_pressed()) not in ENTER:
+        told = agent.say({"do": "health"})
         if not key:
-            told = say(socket, {"do": "health"})
             if told["waiting"] != "distance" or told["trial"] != trial:  # told elsewhere
                 print()
                 return
@@ -110,15 +109,15 @@ def _measure(socket: Path, trial: str) -> None:
             print("\b \b", end="", flush=True)
         else:
             print()
-            _press(socket, " ", "")
+            _press(agent, " ", "")
             print(f"{ASKED}{typed}", end="", flush=True)
     print()
     try:
         if typed:
             metres = float(typed.replace(",", "."))
-            say(socket, {"do": "distance", "distance": metres, "trial": trial})
+            agent.say({"do": "distance", "distance": metres, "trial": trial})
         else:
-            say(socket, {"do": "skip", "reason": "not measured"})
+            agent.say({"do": "skip", "reason": "not measured"})
     except (InputError, ValueError) as error:
         print(error)
 

@@ -2,8 +2,10 @@
 
 import os
 import pty
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -186,6 +188,26 @@ def test_a_terminal_that_is_lost_stops_the_robot(tmp_path: Path) -> None:
             os.close(keys)
             assert "terminal is gone" in made.until("stopped")["reason"]
             assert process.wait(timeout=20) == 1
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_prompt_that_is_killed_or_hangs_stops_the_robot(tmp_path: Path, end: int) -> None:
+    """It can tell nobody; with the robot at rest it may be gone."""
+    (hold,) = written(tmp_path, "hold")
+    with lab(tmp_path, speed=1.0) as made:
+        made.side(cmd="reset", hold="rope")
+        made.start()
+        made.say("enable")
+        with at_the_keys(made, hold) as (process, _):
+            process.kill()
+            process.wait()
+        time.sleep(0.3)
+        assert made.health()["state"] == "enabled"
+        with at_the_keys(made, hold) as (process, keys):
+            os.write(keys, b"\r")
+            wait(lambda: made.health()["state"] == "running", 40, made.log)
+            process.send_signal(end)
+            assert "terminal is gone" in made.until("stopped")["reason"]
 
 
 @pytest.mark.slow

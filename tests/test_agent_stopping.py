@@ -30,7 +30,7 @@ def heard(tmp_path: Path) -> Iterator[list[dict[str, Any]]]:
         told.append(command)
         return {"limp": True}
 
-    server = ControlServer(tmp_path / "agent.sock", answer)
+    server = ControlServer(tmp_path / "agent.sock", answer, lambda: None)
     server.start()
     yield told
     server.close()
