@@ -6,17 +6,23 @@ configuration while the agent that read an earlier one goes on.
 
 import re
 import sys
+import time
 from contextlib import closing, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hardware_agent.config import Settings
 from hardware_agent.control import Unreachable, say
 from pup.errors import InputError
 
+if TYPE_CHECKING:  # imported where it is needed: most often an agent answers
+    from hardware_agent.bus import Bus
+
 SOCKET = Path("/run/pup-agent/agent.sock")
 """Where an agent listens whose configuration does not tell."""
 TOLD = re.compile(r"""^\s*socket\s*=\s*["']([^"'\n]+)""", re.MULTILINE)
-PERSISTENCE = 2.0  # s of trying to make the robot limp without an agent
+PERSISTENCE = 2.0  # s of trying to take the bus without an agent, and to make the robot limp
+AGAIN = 0.05  # s between two tries to take it
 SWITCH = "use the power switch"
 
 
@@ -78,7 +84,7 @@ def _alone(settings: Settings, verb: str) -> bool:
     try:
         joints = RobotDescription.load(settings.robot).joints
         bus = Bus(settings.bus, [j.servo_id for j in joints if j.servo_id is not None])
-        bus.take()
+        _take(bus)
     except (BusError, InputError) as error:
         _note(verb, f"no agent answers, and no servo was told anything: {error}; {SWITCH}")
         return False
@@ -92,6 +98,21 @@ def _alone(settings: Settings, verb: str) -> bool:
             f"no agent answers, and no servo at {settings.bus.port} says that it is limp; {SWITCH}",
         )
     return limp
+
+
+def _take(bus: "Bus") -> None:
+    """Take the bus; the watchdog process of an agent that is gone may have it for a moment."""
+    from hardware_agent.port import BusyError
+
+    deadline = time.monotonic() + PERSISTENCE
+    while True:
+        try:
+            bus.take()
+            return
+        except BusyError:
+            if time.monotonic() > deadline:
+                raise
+        time.sleep(AGAIN)
 
 
 def _note(verb: str, text: str) -> None:

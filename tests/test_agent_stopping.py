@@ -1,15 +1,19 @@
 """The emergency stop at the robot's computer: it needs no faultless configuration, and no agent."""
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from agents import CONFIG, lab, wait
+from test_agent import IDS
 from test_agent_holds import enabled
 
 from hardware_agent import stopping
+from hardware_agent.bus import Bus
 from hardware_agent.cli import main
+from hardware_agent.config import BusSettings
 from hardware_agent.control import ControlServer
 from pup.errors import InputError
 
@@ -90,6 +94,12 @@ def test_without_an_agent_it_takes_the_bus(
         made.side(cmd="fault", kind="bus_pulled")
         assert main(["stop", "--config", str(made.config)]) == 1
         assert "no servo at" in said(capsys)
+        made.side(cmd="fault", kind="bus_pulled", off=True)
+        other = Bus(BusSettings(str(tmp_path / "bus")), IDS)  # as the watchdog's process does
+        other.take()
+        threading.Timer(0.5, other.close).start()
+        assert main(["stop", "--config", str(made.config)]) == 0
+        assert "torque was turned off over" in said(capsys)
         made.side(cmd="fault", kind="port_pulled")
         wait(lambda: not (tmp_path / "bus").exists(), 10)
         assert main(["stop", "--config", str(made.config)]) == 1
