@@ -174,23 +174,25 @@ class Bus(Line):
           all, and a servo may refuse it.
         """
         own = self.registers
-        if own.bus_watchdog:  # one that has bitten refuses goals, power too, until told so
-            for _ in range(WRITES):
-                self.send_all(own.bus_watchdog, 0)
-        orders = self._orders(goals, deadline)
+        if own.bus_watchdog:  # one that has bitten refuses goals, power too, until told 0
+            for count in (0, min(127, math.ceil(deadline / 0.02))):
+                for _ in range(WRITES):
+                    self.send_all(own.bus_watchdog, count)
+        orders = self._orders(goals)
         for order in orders:
             for _ in range(1 if order.span == own.goal else WRITES):  # time waits for goals
                 self.send(order.span, order.values)
         return {n: told for n in self.ids if (told := self._untaken(n, orders)) is not None}
 
-    def _orders(self, goals: Sequence[float] | Array, deadline: float) -> list[Order]:
-        """What servos shall have in their registers before they hold, the goal last."""
+    def _orders(self, goals: Sequence[float] | Array) -> list[Order]:
+        """What servos must have in their registers before they hold, the goal last.
+
+        Not their watchdog: firmware before 38 has none.
+        """
         own = self.registers
         gains = zip("PID", own.gains, self.settings.gains or own.paper, strict=True)
         same = {f"{name} gain": (span, value) for name, span, value in gains}
         same["goal speed"] = own.speed, 0
-        if own.bus_watchdog:
-            same["bus watchdog"] = own.bus_watchdog, min(127, math.ceil(deadline / 0.02))
         return [
             *(Order(n, span, dict.fromkeys(self.ids, value)) for n, (span, value) in same.items()),
             Order("power limit", own.power_limit, self._power(1.0)),
