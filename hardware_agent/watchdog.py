@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # imported where it is needed: the process is small, and star
 
 ON, OFF, READY, ENDED = b"1", b"0", b"r", b"e"
 PERSISTENCE = 120.0  # s, of trying to make the robot limp: an adapter may be put in again
+TAKEN = 5.0  # s for which the next agent has the bus, while a command has it for less
 AGAIN = 0.25  # s between two tries, in which the next agent may take the bus
 PATIENCE = 3.0  # s for which an agent that ends waits for it
 SPACING = 0.004  # s between packets: a servo's answer may have garbled the first
@@ -142,30 +143,35 @@ def make_limp(bus: "Bus", persistence: float, orphaned: Callable[[], bool] = lam
     Args:
       bus: of the servos; it is let go between two tries.
       persistence: for how long to try, s.
-      orphaned: whether its owner is gone: who else has it then makes the robot limp itself.
+      orphaned: whether its owner is gone: who has it for long then is an agent, which makes the
+        robot limp itself.
 
     Returns:
       Whether a servo answered, and none holds.
     """
     from hardware_agent.port import BusError, BusyError
 
-    deadline, said = time.monotonic() + persistence, ""
-    while time.monotonic() < deadline:
+    free, said = time.monotonic(), ""
+    deadline = free + persistence
+    while (now := time.monotonic()) < deadline:
         holding: set[bool | None] = set()
+        busy = False
         try:
             bus.take()
             holding = _let_go(bus)
         except BusyError:
-            if orphaned():
-                return False
+            busy = True
         except BusError as error:
             if str(error) != said:
                 said = str(error)
                 _say(said)
+        free = free if busy else now
         if True in holding:
             continue
         if False in holding:
             return True
+        if now - free > TAKEN and orphaned():
+            return False
         bus.close()  # an adapter that was out and in again does not answer an old handle
         time.sleep(AGAIN)
     return False

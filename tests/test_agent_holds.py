@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,12 +12,15 @@ from pathlib import Path
 import pytest
 from agents import Lab, bundle, children, lab, standing, wait
 from far_end import Gateway
-from test_agent import assign, at_work
+from test_agent import IDS, assign, at_work
 
+from hardware_agent.bus import Bus
+from hardware_agent.config import BusSettings
 from hardware_agent.request import Request
 from hardware_agent.rollout import recording_id
 from hardware_agent.senses import Senses
 from hardware_agent.status import LONGEST, Refused, brief
+from hardware_agent.watchdog import make_limp
 from pup.errors import InputError
 from pup.wire import Armed, Assign, Finished, Outcome, RecordingChunk, Running, Stop
 
@@ -129,6 +133,23 @@ def test_the_watchdog_waits_for_an_adapter_that_is_out_when_the_agent_is_killed(
         made.side(cmd="fault", kind="port_pulled", off=True)
         wait(lambda: holding(made) == 0, 10, made.log)
         wait(lambda: "the agent has ended; torque is off" in made.log(), 10, made.log)
+
+
+def test_the_watchdog_outlasts_a_command_that_has_the_bus_for_a_moment(tmp_path: Path) -> None:
+    """Which may leave servos holding, where it was no agent."""
+    settings = BusSettings(str(tmp_path / "bus"), timeout=0.05)
+    with lab(tmp_path) as made:
+        made.start()
+        made.end()
+        other, own = Bus(settings, IDS), Bus(settings, IDS)
+        other.take()
+        threading.Timer(1.0, other.close).start()
+        assert make_limp(own, 20.0)
+        own.close()
+        other.take()
+        before = time.monotonic()
+        assert not make_limp(own, 20.0), "another agent has it"
+        assert time.monotonic() - before < 15.0
 
 
 def test_a_watchdog_that_finds_nobody_leaves_the_bus_to_the_next_agent(tmp_path: Path) -> None:
