@@ -305,6 +305,13 @@ def test_motions_that_come_late_are_admitted(bench: Maker, tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_recordings_that_were_left_out_are_told(backlash: Diagnosis, tmp_path: Path) -> None:
+    shown = page(replace(backlash, lost=("r1", "r7")), tmp_path)
+    assert "R1 and r7 were left out: nothing that was found" in shown.text
+    assert "left out: nothing that was found" not in page(backlash, tmp_path).text
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_an_error_that_nothing_explains_is_admitted(bench: Maker, tmp_path: Path) -> None:
     shown = page(bench.nothing(2.9), tmp_path)
     assert "No known effect is missing, but the simulator is off by 2.9 times" in shown.text

@@ -1,5 +1,8 @@
-"""Where effects are looked for."""
+"""Where effects are looked for, and in which forms."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from pup.diagnosis.hypotheses import hypotheses
@@ -44,3 +47,15 @@ def test_a_free_torso_is_pushed_and_links_where_some_motions_hang(hanging: tuple
     assert len(set(pushed)) == len(pushed)
     assert robot.torso in pushed
     assert ("l_knee_link" in pushed) == bool(hanging)
+
+
+@pytest.mark.parametrize("power", [1.0, 0.0])
+def test_what_becomes_of_an_integral_is_asked_where_the_torque_goes_off(power: float) -> None:
+    robot = RobotDescription.load("servo_bench")
+    runs = recordings(robot, 60, MOTIONS)
+    told = np.where(np.arange(60) < 30, 1.0, power)
+    limp = [*runs[:-1], replace(runs[-1], extras={"torque_enabled": told})]
+    forms = {
+        h.choices for h in hypotheses(Measured.of(robot, limp)) if h.effect == "integral_action"
+    }
+    assert forms == ({(0.0,)} if power else {(0.0,), (1.0,)})

@@ -8,14 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pup.diagnosis.coordinates import nominal_coordinate
+from pup.diagnosis.document import document
+from pup.diagnosis.engine import diagnose
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, origins, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.search import followed, in_the_air, search
+from pup.diagnosis.search import followed, followed_well, in_the_air, search
 from pup.physics.parameters import robot_space
+from pup.physics.terms import CLASS_OF
 from pup.recording import Recording
 from tests.blind_sets import ENOUGH, FRICTION, shortened
 from tests.diagnosis_cases import BENCH, recordings
@@ -126,6 +129,42 @@ def test_a_motion_that_gets_lost_comes_second(runs: tuple[Recording, ...]) -> No
 def test_where_too_few_are_left_all_are_taken(runs: tuple[Recording, ...]) -> None:
     lost = [replace(run, position=run.position + 1.0) for run in runs[2:]]
     assert kept((*runs[:2], *lost)) == []
+
+
+def test_what_is_followed_best_is_looked_at_where_all_of_it_leads_nowhere(
+    runs: tuple[Recording, ...],
+) -> None:
+    def well(*off: float) -> list[int]:
+        measured = Measured.of(BENCH, runs)
+        replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+        fit = Fit((), np.empty(0), residual=np.array(off)[measured.recording])
+        return followed_well(
+            Nominal(fit, assumed_noise(measured), Certificate((1.0, 1.0), True, 0.0)), replays
+        )
+
+    assert well(3, 4, 5, 2, 30) == [0, 1, 2, 3]
+    assert well(3, 4, 5, 2, 5) == []
+    assert well(0.1, 0.2, 1.5, 0.3, 1.9) == []  # noise is not far from noise
+    assert well(3, 30, 3, 30, 30) == [0, 2]
+
+
+def test_a_motion_that_nothing_explains_is_left_out_and_told() -> None:
+    """Somebody held the arm: what is missing in the others is found, and is of them alone."""
+    runs = recordings(FRICTION)
+    chirp = next(i for i, run in enumerate(runs) if run.motion == "chirp")
+    held = replace(runs[chirp], position=-runs[chirp].position)
+    told = diagnose(
+        BENCH,
+        [*runs[:chirp], held, *runs[chirp + 1 :]],
+        lambda measured: threads(Bench(measured), 1),
+        1,
+        lambda stage, share: None,
+    )
+    assert told.verdict == "mismatch"
+    assert CLASS_OF[told.findings[0].effect] == CLASS_OF["coulomb_friction"]
+    assert told.lost == (held.id,)
+    assert held.id not in {r.id for r in told.measured.recordings}
+    assert held.id in document(told, "corrected")["reason"]
 
 
 def test_where_contact_leads_astray_what_is_in_the_air_comes_first(

@@ -251,6 +251,16 @@ def test_an_integral_does_not_wind_up_while_the_torque_is_off() -> None:
     assert np.abs(later[50:] - at_once).max() < 1e-3
 
 
+def test_a_lasting_integral_does() -> None:
+    """The joint is sent off with all that a second of errors has made of it."""
+    lasting = f"integral_action/lasting{AT}"
+    row = {f"integral_action/gain{AT}": 1.0, lasting: 1.0}
+    off = {"torque_enabled": (np.arange(100) >= 50).astype(float)}
+    forgets, lasts = bench(held(0.5, 2.0, 0.0, extras=off), {**row, lasting: 0.0}, row)
+    assert (lasts[53:60] > forgets[53:60] + 0.01).all()
+    assert np.abs(lasts[:50] - forgets[:50]).max() == 0.0
+
+
 def test_a_dead_band_adds_its_width_to_every_error() -> None:
     for angle in (0.5, -0.5):
         (read,) = bench(held(angle), {f"dead_band/width{AT}": 0.01})

@@ -39,7 +39,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
         "robot": robot.name,
         "position_unit": position,
         "verdict": diagnosis.verdict,
-        "reason": diagnosis.reason,
+        "reason": "; ".join(filter(None, (diagnosis.reason, _lost(diagnosis)))),
         "converged": certificate.holds,
         "noise_floor": {
             "rms": float(np.sqrt(np.mean(noise.sigma[:joints] ** 2))),
@@ -57,6 +57,12 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
         "samples": len(diagnosis.measured.values),
         "simulations": diagnosis.replays,
     }
+
+
+def _lost(diagnosis: Diagnosis) -> str:
+    if not diagnosis.lost:
+        return ""
+    return f"left out, as nothing found in the others explains them: {', '.join(diagnosis.lost)}"
 
 
 def _finding(finding: Finding, diagnosis: Diagnosis, units: Mapping[str, str]) -> dict[str, Any]:

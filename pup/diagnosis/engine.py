@@ -31,7 +31,17 @@ from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.search import Search, followed, in_the_air, search, search_on
+from pup.diagnosis.search import (
+    Search,
+    carried,
+    drags,
+    followed,
+    followed_well,
+    in_the_air,
+    nowhere,
+    search,
+    search_on,
+)
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.splits import Split, splits
 from pup.diagnosis.verdict import Answer, Finding, findings, in_order
@@ -72,6 +82,7 @@ class Diagnosis:
       unexplained: what the known effects leave; None where that is noise.
       slight: effects that were found and do not matter.
       origins: of parts of one recording, that recording's id and when in it each begins, s.
+      lost: recordings that were left out, as nothing found in the others makes them follow.
       splits: how the nominal model's parameters differ between halves of the data, and how those
         of the model with what was found.
     """
@@ -96,6 +107,7 @@ class Diagnosis:
     slight: tuple[Hypothesis, ...] = ()
     origins: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
+    lost: tuple[str, ...] = ()
 
     @property
     def noise(self) -> Noise:
@@ -162,13 +174,27 @@ def diagnose(
     if first is None or contact:
         nominal = certified(nominal, replays, rng)
     if first is None and not nominal.certificate.holds:
-        first = _first_look(in_the_air(measured), replays, rng, progress, effects)
+        near = in_the_air(measured) or followed_well(nominal, replays)
+        first = _first_look(near, replays, rng, progress, effects)
     if first is not None:
-        whole, some = nominal.certificate, first[0].certificate
-        nominal = replace(nominal, certificate=some.beside(whole) if contact else some)
+        whole, part = nominal.certificate, first[0].certificate
+        nominal = replace(nominal, certificate=part.beside(whole) if contact else part)
     if not nominal.certificate.holds:
         return told("undetermined", _unsettled(nominal))
     done = search(replays, nominal, rng, progress, first[1] if first else None, effects)
+    if done is not None and not contact:
+        if first is None and nowhere(done, nominal):
+            # Around a motion that is far off no slope shows what is missing, though none is lost.
+            first = _first_look(followed_well(nominal, replays), replays, rng, progress, effects)
+            if first is not None and carried(first[1], replays, nominal) is not nominal.fit:
+                again = search(replays, nominal, rng, progress, first[1], effects)
+                done = min((s for s in (done, again) if s), key=lambda s: s.model.worth)
+        if first is not None and drags(first[1], done):
+            kept = first[1].selector.replays.measured.recordings
+            some = diagnose(robot, kept, runner, lanes, progress, seed, effects)
+            left_out = {r.id for r in measured.recordings} - {r.id for r in kept}
+            lost = tuple(sorted({*some.lost, *left_out}))
+            return replace(some, lost=lost, replays=some.replays + replays.count)
     if done is not None and nominal.noise.source == "assumed":
         nominal, done = _weighed(nominal, done, replays, rng, progress, effects)
     if done is None:

@@ -19,6 +19,9 @@ FROM_OUTSIDE = frozenset(("external_force",))
 """Effects of a wrench: on the torso where it is free, on links where that is fixed. One joint alone
 cannot tell a force on its link from a centre of mass elsewhere."""
 
+LASTING = "lasting"
+"""A shape that says what becomes of a state while the torque is off."""
+
 EVERYWHERE = ("robot", "bus")
 """Kinds of places that all servos are at."""
 
@@ -131,11 +134,18 @@ def _shapes(
         yield from _stops(place, measured)
         return
     quantities = [q for q in TERMS[effect].quantities if q.shape]
-    for values in product(*(q.grid for q in quantities)):
+    grids = [q.grid if q.name != LASTING or _goes_limp(measured) else (0.0,) for q in quantities]
+    for values in product(*grids):
         yield tuple(
             (column(effect, q.name, place), v * scale.factor(q.unit))
             for q, v in zip(quantities, values, strict=True)
         )
+
+
+def _goes_limp(measured: Measured) -> bool:
+    """Whether the torque goes off in any recording."""
+    power = (r.extras.get("torque_enabled") for r in measured.recordings)
+    return any(told is not None and bool((told < 1).any()) for told in power)
 
 
 def _stops(place: Place, measured: Measured) -> Iterator[tuple[tuple[str, float], ...]]:

@@ -180,6 +180,13 @@ class _Report:
             f"{self.error(held.before)} to {self.error(held.after)}: by "
             f"{percent(1 - held.after / held.before)} (90 % interval {low} to {high})."
         )
+        if diagnosis.lost:
+            was = "was" if len(diagnosis.lost) == 1 else "were"
+            yield (
+                f"{capital(listed(diagnosis.lost))} {was} left out: nothing that was found in the "
+                "other recordings explains what was recorded there, so more is missing than the "
+                "effects named here."
+            )
         if self.left() > LEFT:
             yield (
                 f"What is left is still {self.left():.1f} times the noise: more is missing than "

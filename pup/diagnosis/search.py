@@ -23,7 +23,7 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
 from pup.diagnosis.selection import full
-from pup.diagnosis.starts import closely
+from pup.diagnosis.starts import closely, puzzling
 from pup.diagnosis.tracing import traces
 from pup.physics.terms.scale import Scale
 
@@ -36,6 +36,15 @@ ASTRAY, FAR = 0.5, 0.2
 much, rad."""
 LEFT = 1 / 3
 """Share of all recordings that must be left for a first look."""
+WELL = 4.0
+"""A recording is followed well whose mean squared error is so many times that of the best third at
+most."""
+LOUD, QUIET = 6.0, 1.5
+"""A model that leaves so many times the noise is not of all that is missing; nothing more is missing
+where it leaves no more than this."""
+DRAGGED = 2.0
+"""A model of all recordings follows some worse than one of these alone does, where what it leaves
+beyond the noise is so many times as much, or so many times the noise."""
 HALFWAY = 3
 """So many effects found are half of what refits do, as far as anybody can know."""
 
@@ -80,7 +89,7 @@ def search(
       most: effects that are looked for.
     """
     progress("score test", 0.3)
-    base = nominal.fit if first is None else _carried(first, replays, nominal)
+    base = nominal.fit if first is None else carried(first, replays, nominal)
     if first is not None and base is not nominal.fit and full(first.model, most):
         found = _seen_first(first, base, replays)  # nothing more is looked for
     else:
@@ -173,8 +182,8 @@ def _teller(progress: Callable[[str, float], None]) -> Callable[[Model], None]:
     return told
 
 
-def _carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
-    """What was found in some recordings, fitted to all; the nominal fit where that is better.
+def carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
+    """What a first look has found, fitted to all recordings; the nominal fit where that is better.
 
     What only the others show, as the floor's friction, starts as the nominal fit has it, or from
     elsewhere.
@@ -197,6 +206,26 @@ def extended(known: Fit, whole: Fit) -> Fit:
         np.r_[whole.at[new], known.at],
         fixed=known.fixed,
     )
+
+
+def nowhere(done: Search, nominal: Nominal) -> bool:
+    """Whether a search has led nowhere: what it leaves is many times the noise, or half of all."""
+    model = done.model
+    loudness = model.fit.chi2 / model.samples
+    little = puzzling(nominal.fit, [(model.hypotheses, model.fit)])
+    return loudness > LOUD or (little and loudness > QUIET)
+
+
+def drags(first: Search, done: Search) -> bool:
+    """Whether some recordings keep a model of all from following what a first look's model follows.
+
+    What is missing there is not what was found, and makes up for it in all the others.
+    """
+    residual = done.model.fit.residual
+    assert residual is not None
+    inside = residual[_looked_at(first, done.model.measured)]
+    own = max(first.model.fit.chi2 - first.model.samples, first.model.samples)
+    return bool(first.model.hypotheses) and float(np.sum(inside**2 - 1)) > DRAGGED * own
 
 
 def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
@@ -228,6 +257,21 @@ def followed(nominal: Nominal, replays: Replays) -> list[int]:
     errors = np.where(np.isnan(errors), np.inf, errors)
     every = range(len(measured.recordings))
     kept = [i for i in every if not _lost(measured, errors, measured.only([i]))]
+    return kept if _worth_a_look(measured, kept) else []
+
+
+def followed_well(nominal: Nominal, replays: Replays) -> list[int]:
+    """The recordings that the nominal model is least off in, next to their noise.
+
+    Empty where it is off as much in nearly all, or where too few are left for a first look.
+    """
+    residual, measured = nominal.fit.residual, replays.measured
+    assert residual is not None
+    count = len(measured.recordings)
+    own = [residual[measured.only([i])] ** 2 for i in range(count)]
+    off = [float(squares.mean()) if len(squares) else np.inf for squares in own]
+    best = sorted(off)[int(np.ceil(LEFT * count)) - 1]
+    kept = [i for i in range(count) if off[i] <= WELL * max(best, 1.0)]
     return kept if _worth_a_look(measured, kept) else []
 
 

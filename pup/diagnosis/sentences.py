@@ -251,7 +251,8 @@ def _integral(f: Facts) -> str:
     error = 0.001 if f.speech.slides else np.radians(1)
     return (
         f"The controller of {f.at} has an integral part: an error of {f.speech.angle(error)} adds "
-        f"{f.speech.torque(f.size['gain'] * error)} every second."
+        f"{f.speech.torque(f.size['gain'] * error)} every second"
+        + (", while the torque is off too." if f.size.get("lasting") else ".")
     )
 
 

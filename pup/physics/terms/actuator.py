@@ -181,13 +181,16 @@ WEAK = 0.02
 class IntegralAction(Term):
     """A controller's integral part, kept within a share of the servo's limit.
 
-    Within it the integral grows also while the servo is at its limit (it winds up).
+    Within it the integral grows also while the servo is at its limit (it winds up). While the
+    torque is off it is forgotten, or is `lasting`: the controller goes on, as one on a computer
+    beside the servo may.
     """
 
     effect = "integral_action"
     quantities = (
         Quantity("gain", "N m/(rad s)", 15.0, 300.0),
         Quantity("share", "1", 0.3, 1.0, grid=(0.1, 0.3, 1.0)),
+        Quantity("lasting", "1", 0.0, 1.0, grid=(0.0, 1.0)),
     )
     source = "estimate: an integral gain that takes a second to double the proportional part"
     state = ("_sum",)
@@ -214,9 +217,10 @@ class IntegralAction(Term):
         drive.torque += self.values["gain"][:n] * self._after(self.scene.timestep / 2, drive.error)
 
     def settle(self, outcome: Outcome) -> None:
-        """See Term: a servo whose torque is off forgets its integral."""
+        """See Term: a servo whose torque is off may forget its integral."""
         after = self._after(self.scene.timestep, outcome.error)
-        self._sum[: len(after)] = after * outcome.on
+        n = len(after)
+        self._sum[:n] = after * np.maximum(outcome.on, self.values["lasting"][:n])
 
     def _after(self, time: float | Array, error: Array) -> Array:
         """What an error makes of the integral in some time, rad s."""
