@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pup.diagnosis.engine import diagnose
-from pup.diagnosis.noise import noise_floor, repeats
+from pup.diagnosis.noise import flutter, noise_floor, repeats
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Bench, threads
 from pup.diagnosis.residuals import Measured
@@ -71,6 +71,14 @@ def test_what_happens_in_one_of_two_repeats_is_found_where_and_when_it_does() ->
     for window in finding.when:
         assert window.end > STUCK[0]
         assert window.start < STUCK[1]
+
+
+def test_a_joint_that_is_still_on_its_way_flutters_no_more() -> None:
+    """It swings for a quarter of the time, command or not."""
+    runs = recordings(NONE)
+    measured = Measured.of(BENCH, runs)
+    swings = 0.03 * np.sin(60 * measured.time) * (measured.time % 2 < 0.5)
+    assert flutter(measured, noise_of(runs) + swings, 0) == pytest.approx(0.002, rel=0.5)
 
 
 def test_without_repeats_or_with_impacts_nothing_is_said() -> None:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.lateness import Difference, lateness, trimmed
+from pup.diagnosis.lateness import NORMAL_MIDDLE, Difference, lateness, trimmed
 from pup.diagnosis.residuals import Measured, Noise
 from pup.physics.terms.scale import Scale
 from pup.recording import Recording
@@ -287,9 +287,14 @@ def flutter(measured: Measured, errors: Array, channel: int) -> float | None:
     """What a channel's readings flutter by from tick to tick, where they are quiet, rad.
 
     Noise without a memory is as large; one that remembers itself is larger. None where nothing was
-    read.
+    read. A joint that is still on its way, or slips now and then, flutters as when it stands.
     """
-    return _bending(_changes(measured, errors, channel)[1])
+    steps, bends = _changes(measured, errors, channel)
+    told = _bending(bends)
+    if told is None or not steps:
+        return told
+    middle = float(np.median(np.diff(np.concatenate(steps)) ** 2))
+    return min(told, float(np.sqrt(middle / NORMAL_MIDDLE / 6)))
 
 
 def _flicker(measured: Measured, errors: Array, channel: int) -> Spread | None:

@@ -40,8 +40,8 @@ WELL = 4.0
 """A recording is followed well whose mean squared error is so many times that of the best third at
 most."""
 LOUD, QUIET = 6.0, 1.5
-"""A model that leaves so many times the noise is not of all that is missing; nothing more is missing
-where it leaves no more than this."""
+"""A model that leaves so many times the noise is not of all that is missing; one that leaves less
+than the other may be."""
 DRAGGED = 2.0
 """A model of all recordings follows some worse than one of these alone does, where what it leaves
 beyond the noise is so many times as much, or so many times the noise."""
