@@ -1,12 +1,13 @@
 """What servos hold on to: a watchdog that has bitten, limits of their own, gains and speeds."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from agents import CONFIG, DARWIN, Lab, wait
+from agents import CONFIG, DARWIN, Lab, changed, wait
 from test_agent_mounting import FACTORY, HEAD, IDS, robot_with
 
 from hardware_agent.body import Body
@@ -19,10 +20,21 @@ from hardware_agent.virtual.tables import MX28_1
 pytest.importorskip("mujoco")
 
 
-def body_of(folder: Path, protocol: int) -> Body:
+def configured(folder: Path, protocol: int, timeout: float) -> Path:
     file = folder / "agent.toml"
-    file.write_text(CONFIG.format(folder=folder, protocol=protocol, clock="lockstep"))
-    return Body(Settings.read(file), DARWIN)
+    text = CONFIG.format(folder=folder, protocol=protocol, clock="lockstep")
+    file.write_text(changed(text, f"[bus]\ntimeout = {timeout}\n"))
+    return file
+
+
+@contextmanager
+def robot_and_body(folder: Path, protocol: int) -> Iterator[tuple[VirtualRobot, Body]]:
+    with robot_with(folder, FACTORY, protocol) as robot:
+        body = Body(Settings.read(configured(folder, protocol, 0.3)), DARWIN)
+        try:
+            yield robot, body
+        finally:
+            body.close()
 
 
 def sensed(body: Body) -> Senses:
@@ -38,8 +50,7 @@ def test_a_watchdog_that_has_bitten_keeps_no_servo_at_the_power_of_a_fallen_robo
     tmp_path: Path,
 ) -> None:
     """A fall, then the agent ends; the servos' own watchdogs bite, and goals are read-only."""
-    with robot_with(tmp_path, FACTORY, protocol=2) as robot:
-        body = body_of(tmp_path, 2)
+    with robot_and_body(tmp_path, 2) as (robot, body):
         body.open()
         assert body.enable(sensed(body)) is None and powers(robot) == {1.0}
         body.make_safe(Response.SOFT, sensed(body), 1.0)
@@ -51,7 +62,6 @@ def test_a_watchdog_that_has_bitten_keeps_no_servo_at_the_power_of_a_fallen_robo
         body.open()
         assert body.enable(sensed(body)) is None
         assert powers(robot) == {1.0}
-        body.close()
 
 
 KEPT = {1: "max_torque", 2: "pwm_limit"}
@@ -61,10 +71,9 @@ POWER = {1: "torque_limit", 2: "goal_pwm"}
 @pytest.mark.parametrize("protocol", [1, 2])
 def test_a_servo_keeps_the_power_limit_of_its_own(tmp_path: Path, protocol: int) -> None:
     """Somebody spares a gear with it: it is neither overwritten nor asked for in vain."""
-    with robot_with(tmp_path, FACTORY, protocol) as robot:
+    with robot_and_body(tmp_path, protocol) as (robot, body):
         memory, full = robot.servos[HEAD].memory, {1: 1023, 2: 885}[protocol]
         memory.put(KEPT[protocol], round(0.6 * full))
-        body = body_of(tmp_path, protocol)
         told = [line for line in body.open() if "power" in line]
         assert told == [f"servo {IDS[HEAD]} gives head_tilt 60% of its power at most"]
         assert body.enable(sensed(body)) is None
@@ -76,12 +85,10 @@ def test_a_servo_keeps_the_power_limit_of_its_own(tmp_path: Path, protocol: int)
         body.bus.read()
         assert memory.get(POWER[protocol]) == round(0.6 * full)
         assert robot.servos[0].memory.get(POWER[protocol]) == full
-        body.close()
 
 
 def test_a_servo_that_keeps_its_power_limit_is_named_and_nothing_holds(tmp_path: Path) -> None:
-    with robot_with(tmp_path, FACTORY, protocol=2) as robot:
-        body = body_of(tmp_path, 2)
+    with robot_and_body(tmp_path, 2) as (robot, body):
         body.open()
         servo = robot.servos[HEAD]
         servo.memory.put("goal_pwm", 177)
@@ -89,7 +96,6 @@ def test_a_servo_that_keeps_its_power_limit_is_named_and_nothing_holds(tmp_path:
         refused = body.enable(sensed(body))
         assert str(refused) == ("enable: not taken: head_tilt has power limit 177 instead of 885")
         assert not any(s.memory.get("torque_enable") for s in robot.servos)
-        body.close()
 
 
 LEFT = {1: ("d_gain", 26), 2: ("position_d_gain", 80)}
@@ -101,8 +107,7 @@ ACCELERATION = {1: "goal_acceleration", 2: "profile_acceleration"}
 def test_gains_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int) -> None:
     """Another program left its own; noise spoils one packet with the D gain, or both."""
     gain, address = LEFT[protocol]
-    with robot_with(tmp_path, FACTORY, protocol) as robot:
-        body = body_of(tmp_path, protocol)
+    with robot_and_body(tmp_path, protocol) as (robot, body):
         body.open()
         for servo in robot.servos:
             servo.memory.put(gain, 99)
@@ -123,37 +128,32 @@ def test_gains_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int)
             assert not any(s.memory.get("torque_enable") for s in robot.servos)
         else:
             assert refused is None
-        body.close()
 
 
 @pytest.mark.parametrize("protocol", [1, 2])
 def test_an_acceleration_that_another_program_left_is_taken_back(
     tmp_path: Path, protocol: int
 ) -> None:
-    with robot_with(tmp_path, FACTORY, protocol) as robot:
-        body = body_of(tmp_path, protocol)
+    with robot_and_body(tmp_path, protocol) as (robot, body):
         body.open()  # which gives servos current
         robot.servos[HEAD].memory.put(ACCELERATION[protocol], 10)
         told = [line for line in body.open() if "acceleration" in line]
         assert told == [f"servo {IDS[HEAD]}: goal acceleration 10 made 0"]
         assert robot.servos[HEAD].memory.get(ACCELERATION[protocol]) == 0
-        body.close()
 
 
 def test_old_firmware_has_no_acceleration(tmp_path: Path) -> None:
-    with robot_with(tmp_path, FACTORY) as robot:
+    with robot_and_body(tmp_path, 1) as (robot, body):
         old = replace(MX28_1, size=52, registers=MX28_1.registers[:-1])
         robot.servos[HEAD].memory.table = old
-        body = body_of(tmp_path, 1)
         body.open()
         assert body.enable(sensed(body)) is None
-        body.close()
 
 
 def test_servos_whose_board_was_reset_get_their_current_back(tmp_path: Path) -> None:
     """By the agent, which nobody has to start again."""
     with robot_with(tmp_path, FACTORY) as robot:
-        body_of(tmp_path, 1)
+        configured(tmp_path, 1, 0.05)
         made = Lab(tmp_path, cast(Any, None))  # the robot lives in this process
         try:
             made.start()
