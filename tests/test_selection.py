@@ -244,6 +244,7 @@ def test_rivals_of_other_classes_are_compared_as_closely_as_the_best(
     """However many forms of the best one stand between them."""
     ended: list[Fit] = []
     monkeypatch.setattr(selection, "closely", lambda fits, *more: ended.extend(fits))
+    monkeypatch.setattr(selection, "begun_anew", nothing)
     known = [FIRST] * 6 + [RIVAL, OTHER, LAST]
     fits = [replace(MAKER.model(h, 1.0).fit, chi2=5000.0 + i) for i, h in enumerate(known)]
     fits[-1].chi2 = 6000.0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pup.diagnosis import starts
 from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import complete, fit_together
@@ -14,7 +15,7 @@ from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import free_names
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.starts import described, distinct, puzzling
+from pup.diagnosis.starts import LOUD, begun_anew, described, distinct, puzzling
 from pup.physics.parameters import robot_space
 from tests.diagnosis_cases import BENCH, recordings
 
@@ -88,3 +89,24 @@ def test_of_fits_with_the_same_effect_the_best_counts(replays: Replays) -> None:
         fit.chi2 = chi2
     told = distinct(list(zip([(lag,), (lag,), (other,)], fits, strict=True)))
     assert [(h[-1].effect, f.chi2) for h, f in told] == [("actuator_lag", 20.0), ("backlash", 25.0)]
+
+
+@pytest.mark.parametrize(("found", "kept"), [(7.0, 7.0), (30.0, 20.0)])
+def test_a_fit_out_of_step_is_begun_by_beginnings_and_the_better_one_stays(
+    replays: Replays, monkeypatch: pytest.MonkeyPatch, found: float, kept: float
+) -> None:
+    """What is near the noise stays as it is."""
+    samples = len(replays.measured.values)
+
+    def ends(fits: list[Fit], *_: object) -> None:
+        for fit in fits:
+            fit.chi2 = found * samples
+
+    monkeypatch.setattr(starts, "begun", lambda fits, *_: [fit.at.fill(0.5) for fit in fits])
+    monkeypatch.setattr(starts, "closely", ends)
+    near, far = nominal(), nominal()
+    near.chi2, far.chi2 = (LOUD - 1) * samples, 20.0 * samples
+    begun_anew([near, far], replays, assumed_noise(replays.measured))
+    assert near.chi2 == (LOUD - 1) * samples
+    assert far.chi2 == kept * samples
+    assert bool((far.at == 0.5).all()) is (found == kept)

@@ -152,6 +152,12 @@ def lagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     return torque - KD * v + weight(q), [(servo(target - q, v) + KD * v - torque) / 0.008]
 
 
+def lagging_twice(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, torque, first = x
+    asked = servo(target - q, v) + KD * v
+    return torque - KD * v + weight(q), [(first - torque) / 0.004, (asked - first) / 0.004]
+
+
 def sagging(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     q, v, left = x
     torque = np.clip(KP * left * (target - q) - KD * v, -LIMIT * left, LIMIT * left)
@@ -241,6 +247,13 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "load_dependent_friction": ({"share": 0.15}, by_load, (0.0,), INERTIA, 7e-4),
     "gear_efficiency": ({"loss": 0.2}, lossy, (0.0,), INERTIA, 4e-4),
     "actuator_lag": ({"time": 0.008}, lagging, (FIRST,), INERTIA, 2e-4),
+    "actuator_lag, in two stages": (
+        {"time": 0.008, "stages": 2.0},
+        lagging_twice,
+        (FIRST, FIRST),
+        INERTIA,
+        4e-4,
+    ),
     "voltage_sag": ({"drop": 0.1}, sagging, (1.0,), INERTIA, 1e-4),
     "armature": ({"inertia": 0.002}, plain, (), INERTIA + 0.002, 1e-4),
     "payload": ({"mass": 0.1}, heavier, (), INERTIA + 0.1 * 0.01, 1e-4),

@@ -26,6 +26,7 @@ from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.shortlist import in_contact, shortlist, suspected
 from pup.diagnosis.starts import (
     Tried,
+    begun_anew,
     closely,
     described,
     distinct,
@@ -290,6 +291,7 @@ class Selector:
             if fit is fits[0] or (rank < CLOSE and fit.chi2 < 1.02 * least + MARGIN)
         ]
         closely([*own, *close], self.replays, self.noise)
+        begun_anew(own, self.replays, self.noise)
 
     def parted(self, before: Model, finalists: Sequence[Model]) -> tuple[list[Model], list[Model]]:
         """Finalists that hold against a model, and those that do not, the best first of each."""

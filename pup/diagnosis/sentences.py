@@ -337,7 +337,7 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     ),
     "actuator_lag": lambda f: (
         f"What drives {f.at} lags {f.speech.quantity(f.size['time'], 's')} behind what the "
-        "controller asks for."
+        f"controller asks for{', in two stages' if f.size.get('stages', 1.0) > 1.5 else ''}."
     ),
     "voltage_sag": _sag,
     "thermal_drift": _drift,

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.beginnings import begun
 from pup.diagnosis.coordinates import described_at, term_coordinate
 from pup.diagnosis.evidence import Score
 from pup.diagnosis.fit import Fit
@@ -31,6 +32,8 @@ PUZZLING, GLARING = 0.5, 30.0
 """Where the best of all effects leaves this share of what is more than noise, or so many times the
 noise, they are begun elsewhere too: the right one may have stopped halfway, as a gear's friction
 that all but holds its joint."""
+LOUD = 6.0
+"""A fit that leaves so many times the noise may have stopped anywhere."""
 UNUSUAL = np.log(3.0)
 """A nominal parameter further than this from the robot's description may have been led astray."""
 
@@ -141,6 +144,21 @@ def joined(fit: Fit, rival: Fit, own: Hypothesis) -> Fit:
         thorough=False,
         slack=ROUGHLY,
     )
+
+
+def begun_anew(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
+    """Fits that leave many times the noise, begun where beginnings of recordings lead if better.
+
+    What swings gets out of step, and a fit to all of it stops anywhere: of two forms of a class the
+    right one may so be the worse.
+    """
+    far = [fit for fit in fits if fit.chi2 > LOUD * len(replays.measured.values)]
+    others = [Fit(f.coordinates, f.at.copy(), fixed=f.fixed, slack=f.slack) for f in far]
+    begun(others, replays, noise)
+    closely(others, replays, noise)
+    for fit, other in zip(far, others, strict=True):
+        if other.chi2 < fit.chi2:
+            vars(fit).update(vars(other))
 
 
 def closely(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:

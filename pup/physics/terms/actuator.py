@@ -41,24 +41,33 @@ class TorqueSpeedLimit(Term):
 
 
 class ActuatorLag(Term):
-    """What drives the servo follows what the law asks for with a time constant.
+    """What drives the servo follows what the law asks for with a time constant, or two of half.
 
-    The law's damping is the motor's own, back-EMF and grease, and does not wait.
+    The law's damping is the motor's own, back-EMF and grease, and does not wait. Nor does a torque
+    that is switched off or on: it is the controller that lags, and goes on while it is off.
     """
 
     effect = "actuator_lag"
-    quantities = (Quantity("time", "s", 0.008, 0.06),)
+    quantities = (
+        Quantity("time", "s", 0.008, 0.06),
+        Quantity("stages", "1", 1.0, 2.0, grid=(1.0, 2.0)),
+    )
     source = "estimate: 5 to 15 ms of current loop and filters"
+    starts = (0.6, 1.2, 2.0)
     needs_law_damping = True
-    state = ("_lagging", "_asked", "_ahead")
+    state = ("_lagging", "_asked", "_ahead", "_lagging_more", "_asked_more", "_ahead_more")
 
     def prepare(self) -> None:
         """See Term."""
-        steps = self.scene.timestep / np.maximum(self.values["time"], 1e-9)
+        two = self.values["stages"] > 1.5
+        self._time = self.values["time"] / np.where(two, 2, 1)
+        self._more = np.where(two, self._time, 0.0)
+        steps = self.scene.timestep / np.maximum(self._time, 1e-9)
         self._kept = np.exp(-steps)
         self._share = 1 - (1 - self._kept) / steps
         self._lagging = np.full_like(steps, np.nan)
-        self._asked, self._ahead = np.zeros_like(steps), np.zeros_like(steps)
+        self._lagging_more = np.where(two, np.nan, 0.0)
+        self._asked, self._ahead, self._asked_more, self._ahead_more = np.zeros((4, *steps.shape))
 
     def flow(self, flow: Flow) -> None:
         """See Term: what is applied is the mean over the sub-step.
@@ -67,19 +76,23 @@ class ActuatorLag(Term):
         """
         law = flow.law_damping
         assert law is not None
-        kernels.lag(
-            flow.torque,
-            flow.damping,
-            flow.velocity,
-            law,
-            implicit_share(law, self.scene.inertia[: len(law)], self.scene.timestep),
-            self.values["time"],
-            self._kept,
-            self._share,
-            self._lagging,
-            self._asked,
-            self._ahead,
+        share = implicit_share(law, self.scene.inertia[: len(law)], self.scene.timestep)
+        asked, ahead = (self._asked, self._asked_more), (self._ahead, self._ahead_more)
+        stages = zip(
+            (self._time, self._more), (self._lagging, self._lagging_more), asked, ahead, strict=True
         )
+        for time, *kept in list(stages)[: 1 + bool(self._more.any())]:
+            kernels.lag(
+                flow.torque,
+                flow.damping,
+                flow.velocity,
+                law,
+                share,
+                time,
+                self._kept,
+                self._share,
+                *kept,
+            )
 
 
 class VoltageSag(Term):

@@ -141,6 +141,9 @@ def lag(
     """
     for i in range(velocity.shape[0]):
         for j in range(velocity.shape[1]):
+            if torque[i, j] == 0 and damping[i, j] == 0:
+                lagging[i, j] = math.nan  # it is off
+                continue
             last = asked[i, j] + ahead[i, j] * velocity[i, j]
             lagging[i, j] = last + kept[i, j] * (lagging[i, j] - last)
             own = (1 - implicit[i, j]) * law[i, j] * velocity[i, j]
