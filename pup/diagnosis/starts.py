@@ -34,6 +34,8 @@ noise, they are begun elsewhere too: the right one may have stopped halfway, as 
 that all but holds its joint."""
 LOUD = 6.0
 """A fit that leaves so many times the noise may have stopped anywhere."""
+LIMB = 6
+"""Joints up to which that is done."""
 UNUSUAL = np.log(3.0)
 """A nominal parameter further than this from the robot's description may have been led astray."""
 
@@ -150,8 +152,11 @@ def begun_anew(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Fits that leave many times the noise, begun where beginnings of recordings lead if better.
 
     What swings gets out of step, and a fit to all of it stops anywhere: of two forms of a class the
-    right one may so be the worse.
+    right one may so be the worse. Not of whole robots, which it would take minutes of, and which
+    `beginnings.nearer` looks after where they stand.
     """
+    if len(replays.measured.robot.joints) > LIMB:
+        return
     far = [fit for fit in fits if fit.chi2 > LOUD * len(replays.measured.values)]
     others = [Fit(f.coordinates, f.at.copy(), fixed=f.fixed, slack=f.slack) for f in far]
     begun(others, replays, noise)
