@@ -192,9 +192,10 @@ def diagnose(
         if first is not None and drags(first[1], done):
             kept = first[1].selector.replays.measured.recordings
             some = diagnose(robot, kept, runner, lanes, progress, seed, effects)
-            left_out = {r.id for r in measured.recordings} - {r.id for r in kept}
-            lost = tuple(sorted({*some.lost, *left_out}))
-            return replace(some, lost=lost, replays=some.replays + replays.count)
+            if some.verdict == "mismatch":  # of the others alone, nothing else may be said
+                left_out = {r.id for r in measured.recordings} - {r.id for r in kept}
+                lost = tuple(sorted({*some.lost, *left_out}))
+                return replace(some, lost=lost, replays=some.replays + replays.count)
     if done is not None and nominal.noise.source == "assumed":
         nominal, done = _weighed(nominal, done, replays, rng, progress, effects)
     if done is None:
