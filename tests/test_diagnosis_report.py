@@ -307,7 +307,7 @@ def test_motions_that_come_late_are_admitted(bench: Maker, tmp_path: Path) -> No
 @pytest.mark.usefixtures("undrawn")
 def test_recordings_that_were_left_out_are_told(backlash: Diagnosis, tmp_path: Path) -> None:
     shown = page(replace(backlash, lost=("r1", "r7")), tmp_path)
-    assert "R1 and r7 were left out: nothing that was found" in shown.text
+    assert "Recordings r1 and r7 were left out: nothing that was found" in shown.text
     assert "left out: nothing that was found" not in page(backlash, tmp_path).text
 
 

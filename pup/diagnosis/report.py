@@ -181,11 +181,11 @@ class _Report:
             f"{percent(1 - held.after / held.before)} (90 % interval {low} to {high})."
         )
         if diagnosis.lost:
-            was = "was" if len(diagnosis.lost) == 1 else "were"
+            s, was = ("", "was") if len(diagnosis.lost) == 1 else ("s", "were")
             yield (
-                f"{capital(listed(diagnosis.lost))} {was} left out: nothing that was found in the "
-                "other recordings explains what was recorded there, so more is missing than the "
-                "effects named here."
+                f"Recording{s} {listed(diagnosis.lost)} {was} left out: nothing that was found in "
+                "the others explains what was recorded there, where something acts that is not "
+                "named here."
             )
         if self.left() > LEFT:
             yield (
