@@ -104,7 +104,9 @@ ACCELERATION = {1: "goal_acceleration", 2: "profile_acceleration"}
 
 @pytest.mark.parametrize("protocol", [1, 2])
 @pytest.mark.parametrize("lost", [1, 2])
-def test_gains_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int) -> None:
+def test_gains_arrive_or_nothing_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int, lost: int
+) -> None:
     """Another program left its own; noise spoils one packet with the D gain, or both."""
     gain, address = LEFT[protocol]
     with robot_and_body(tmp_path, protocol) as (robot, body):
@@ -119,7 +121,7 @@ def test_gains_arrive_or_nothing_holds(tmp_path: Path, protocol: int, lost: int)
             else:
                 send(span, values)
 
-        body.bus.send = noisy  # type: ignore[method-assign]
+        monkeypatch.setattr(body.bus, "send", noisy)
         refused = body.enable(sensed(body))
         if lost == 2:
             wanted = REGISTERS[protocol].paper[2]

@@ -23,7 +23,7 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
 from pup.diagnosis.selection import full
-from pup.diagnosis.starts import closely, puzzling
+from pup.diagnosis.starts import LOUD, closely, puzzling
 from pup.diagnosis.tracing import traces
 from pup.physics.terms.scale import Scale
 
@@ -39,9 +39,8 @@ LEFT = 1 / 3
 WELL = 4.0
 """A recording is followed well whose mean squared error is so many times that of the best third at
 most."""
-LOUD, QUIET = 6.0, 1.5
-"""A model that leaves so many times the noise is not of all that is missing; one that leaves less
-than the other may be."""
+QUIET = 1.5
+"""A model that leaves less than so many times the noise may be of all that is missing."""
 DRAGGED = 2.0
 """A model of all recordings follows some worse than one of these alone does, where what it leaves
 beyond the noise is so many times as much, or so many times the noise."""

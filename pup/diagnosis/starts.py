@@ -33,7 +33,7 @@ PUZZLING, GLARING = 0.5, 30.0
 noise, they are begun elsewhere too: the right one may have stopped halfway, as a gear's friction
 that all but holds its joint."""
 LOUD = 6.0
-"""A fit that leaves so many times the noise may have stopped anywhere."""
+"""A fit that leaves so many times the noise may have stopped anywhere, or lacks much."""
 LIMB = 6
 """Joints up to which that is done."""
 UNUSUAL = np.log(3.0)
