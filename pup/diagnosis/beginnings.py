@@ -66,9 +66,7 @@ def nearer(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     far = [fit for fit in fits if ground and not noise_like(fit)]
     if not far:
         return
-    others = [
-        Fit(f.coordinates, f.at.copy(), fixed=f.fixed, data=f.data, slack=f.slack) for f in far
-    ]
+    others = [fit.fresh() for fit in far]
     begun(others, replays, noise)
     before = [fit.chi2 for fit in far]
     start_best(far, [[other.at] for other in others], replays, noise)

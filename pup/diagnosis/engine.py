@@ -186,8 +186,9 @@ def diagnose(
         if first is None and nowhere(done, nominal):
             # Around a motion that is far off no slope shows what is missing, though none is lost.
             first = _first_look(followed_well(nominal, replays), replays, rng, progress, effects)
-            if first is not None and carried(first[1], replays, nominal) is not nominal.fit:
-                again = search(replays, nominal, rng, progress, first[1], effects)
+            base = carried(first[1], replays, nominal) if first else nominal.fit
+            if first is not None and base is not nominal.fit:
+                again = search(replays, nominal, rng, progress, first[1], effects, base)
                 done = min((s for s in (done, again) if s), key=lambda s: s.model.worth)
         if first is not None and drags(first[1], done):
             kept = first[1].selector.replays.measured.recordings

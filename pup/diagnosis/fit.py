@@ -63,6 +63,12 @@ class Fit:
     contact: float = WIDE
     slack: float = 1e-5
 
+    def fresh(self) -> "Fit":
+        """One of the same to the same, from where this stands, that has not begun."""
+        return Fit(
+            self.coordinates, self.at.copy(), fixed=self.fixed, data=self.data, slack=self.slack
+        )
+
     @property
     def least(self) -> float:
         """Gain of chi-squared that counts."""

@@ -293,7 +293,7 @@ def flutter(measured: Measured, errors: Array, channel: int) -> float | None:
     told = _bending(bends)
     if told is None or not steps:
         return told
-    middle = float(np.median(np.diff(np.concatenate(steps)) ** 2))
+    middle = float(np.median(np.concatenate([np.diff(rest) for rest in steps]) ** 2))
     return min(told, float(np.sqrt(middle / NORMAL_MIDDLE / 6)))
 
 

@@ -76,6 +76,7 @@ def search(
     progress: Callable[[str, float], None],
     first: Search | None = None,
     most: int = 8,
+    base: Fit | None = None,
 ) -> Search | None:
     """Look for effects; None where the motions would show none.
 
@@ -86,9 +87,11 @@ def search(
       progress: told the stage and the share of all that is done.
       first: what was found in some of the recordings.
       most: effects that are looked for.
+      base: what `carried` makes of that, where it is known.
     """
     progress("score test", 0.3)
-    base = nominal.fit if first is None else carried(first, replays, nominal)
+    if base is None:
+        base = nominal.fit if first is None else carried(first, replays, nominal)
     if first is not None and base is not nominal.fit and full(first.model, most):
         found = _seen_first(first, base, replays)  # nothing more is looked for
     else:

@@ -158,7 +158,7 @@ def begun_anew(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     if len(replays.measured.robot.joints) > LIMB:
         return
     far = [fit for fit in fits if fit.chi2 > LOUD * len(replays.measured.values)]
-    others = [Fit(f.coordinates, f.at.copy(), fixed=f.fixed, slack=f.slack) for f in far]
+    others = [fit.fresh() for fit in far]
     begun(others, replays, noise)
     closely(others, replays, noise)
     for fit, other in zip(far, others, strict=True):

@@ -129,7 +129,7 @@ def _images(robot: RobotDescription, parameters: Sequence[str]) -> dict[str, str
         effect, slash, quantity = what.partition("/")
         of_group = not at and quantity in groups
         lateral = quantity in SIDEWAYS and not of_group
-        body, _, axis = (quantity if effect == "com" else f"{quantity}/").partition("/")
+        body, _, axis = quantity.partition("/")  # of a mass no axis
         of_body = effect in ("mass", "com") and not at
         elsewhere = of_body and (body != robot.torso or axis in SIDEWAYS)
         if lateral or elsewhere or effect in DIRECTED or place not in other:
