@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pup.diagnosis.engine import Diagnosis, diagnose
+from pup.diagnosis.engine import diagnose
 from pup.diagnosis.replays import Bench, threads
+from pup.diagnosis.result import Diagnosis
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
 from pup.robot import RobotDescription, TermSpec

@@ -10,11 +10,12 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from pup.diagnosis.document import document
-from pup.diagnosis.engine import Diagnosis, diagnose
+from pup.diagnosis.engine import diagnose
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.replays import Bench, Replays, Runner, threads
 from pup.diagnosis.report import write_report
 from pup.diagnosis.residuals import Measured
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.rivals import Rivals, compare
 from pup.diagnosis.store import Store
 from pup.files import write_json

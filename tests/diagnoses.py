@@ -7,7 +7,6 @@ import numpy as np
 
 from pup.diagnosis.coordinates import nominal_coordinate, term_coordinate
 from pup.diagnosis.discover import Unexplained
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Projector, Trace, scores
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.held_out import held_out
@@ -20,6 +19,7 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Certificate, Nominal, free_names
 from pup.diagnosis.regimes import Regime, Window
 from pup.diagnosis.residuals import Measured, Noise
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.splits import Ratio, Split
 from pup.diagnosis.verdict import Alternative, Finding, Parameter
 from pup.physics.parameters import robot_space

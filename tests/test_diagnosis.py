@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pup.diagnosis import selection
+from pup.diagnosis import retracing
 from pup.diagnosis.coordinates import Coordinate
-from pup.diagnosis.engine import Diagnosis, diagnose
+from pup.diagnosis.engine import diagnose
 from pup.diagnosis.evidence import Projector, Trace, scores, threshold
 from pup.diagnosis.fit import ENOUGH, Fit
 from pup.diagnosis.fitting import fit_together
@@ -18,6 +18,7 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.noise import noise_floor, quanta, quiet_noise
 from pup.diagnosis.replays import Batch, Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise, steady_start
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.store import Store
 from pup.diagnosis.tracing import traces
 from pup.physics.parameters import robot_space
@@ -68,8 +69,8 @@ def test_what_a_large_effect_hides_is_found_beside_it(monkeypatch: pytest.Monkey
 
     Of very many hypotheses the hopeless are not simulated again.
     """
-    monkeypatch.setattr(selection, "LEADING", 30)
-    monkeypatch.setattr(selection, "MOST", 30)
+    monkeypatch.setattr(retracing, "LEADING", 30)
+    monkeypatch.setattr(retracing, "MOST", 30)
     missing = {
         f"torque_speed_limit/slope@{SERVO}": 0.03,
         f"derivative_kick/gain@{SERVO}": 0.3,
@@ -255,12 +256,12 @@ def test_an_effect_is_simulated_again_for_its_best_form_in_all_its_forms(
     tried = ("cogging", "backlash", "joint_spring", "encoder_eccentricity")
     known = [h for h in hypotheses(measured) if h.effect in tried]
     found = traces(known, fit, replays, noise)
-    monkeypatch.setattr(selection, "LEADING", 1)
-    monkeypatch.setattr(selection, "MOST", 1)
-    selector = selection.Selector(replays, noise, found, 15.0, fit)
-    monkeypatch.setattr(selection, "traces", lambda leading, *more: asked.extend(leading) or [])
+    monkeypatch.setattr(retracing, "LEADING", 1)
+    monkeypatch.setattr(retracing, "MOST", 1)
+    retracer = retracing.Retracer(replays, noise, found, fit)
+    monkeypatch.setattr(retracing, "traces", lambda leading, *more: asked.extend(leading) or [])
     asked: list[Hypothesis] = []
-    kept = selector._traced_anew(fit, known)
+    kept = retracer.anew(fit, known)
     assert fit.jacobian is not None and fit.residual is not None
     project = Projector(fit.jacobian)
     ranking = scores(found, project(fit.residual[:, None])[:, 0])
@@ -285,23 +286,23 @@ def test_where_an_effect_changes_all_others_they_are_all_simulated_again(
     tried = ("backlash", "joint_spring", "coulomb_friction", "encoder_bias", "gain_asymmetry")
     known = [h for h in hypotheses(measured) if h.effect in tried]
     found = traces(known, fit, replays, noise)
-    monkeypatch.setattr(selection, "LEADING", 2)
+    monkeypatch.setattr(retracing, "LEADING", 2)
     counted: list[int] = []
-    simulate = selection.traces
+    simulate = retracing.traces
 
     def counting(some: Sequence[Hypothesis], *more: Any) -> list[Trace]:
         counted.append(len(some))
         return simulate(some, *more)
 
-    monkeypatch.setattr(selection, "traces", counting)
-    selector = selection.Selector(replays, noise, found, 15.0, fit)
-    assert len(selector._traced_anew(fit, known)) == len(found)
+    monkeypatch.setattr(retracing, "traces", counting)
+    retracer = retracing.Retracer(replays, noise, found, fit)
+    assert len(retracer.anew(fit, known)) == len(found)
     assert len(counted) == 1
     assert counted[0] < len(known)
     rng = np.random.default_rng(0)
-    selector.found = tuple(replace(t, whole=rng.normal(size=t.whole.shape)) for t in found)
+    retracer.found = tuple(replace(t, whole=rng.normal(size=t.whole.shape)) for t in found)
     counted.clear()
-    anew = {t.hypothesis: t for t in selector._traced_anew(fit, known)}
+    anew = {t.hypothesis: t for t in retracer.anew(fit, known)}
     assert sum(counted) == len(known)
     for trace in found:
         assert anew[trace.hypothesis].whole == pytest.approx(trace.whole)

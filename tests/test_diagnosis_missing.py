@@ -12,9 +12,9 @@ from test_diagnosis_report import headings, page, speech
 from test_report import Page
 
 from pup.diagnosis import report_missing, report_splits, summary
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.lawfit import Law
 from pup.diagnosis.report_missing import LASTS, clearest
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.sentences import items, sentence
 from pup.diagnosis.wording import percent
 from pup.physics.terms import Place

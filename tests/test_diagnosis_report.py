@@ -15,10 +15,10 @@ from test_report import Page
 from pup.diagnosis import summary
 from pup.diagnosis.document import document
 from pup.diagnosis.drawing import draw_robot
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import WORDS
 from pup.diagnosis.nominal import Certificate
 from pup.diagnosis.report import write_report
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.sentences import sentence
 from pup.diagnosis.verdict import Parameter
 from pup.diagnosis.wording import Speech, percent, shift, spoken

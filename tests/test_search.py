@@ -11,12 +11,13 @@ from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import diagnose
 from pup.diagnosis.fit import Fit
+from pup.diagnosis.looks import followed, followed_well, in_the_air
 from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import SHORTEST, STILL, origins, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.search import followed, followed_well, in_the_air, search
+from pup.diagnosis.search import search
 from pup.physics.parameters import robot_space
 from pup.physics.terms import CLASS_OF
 from pup.recording import Recording

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from pup.diagnosis import exchanges, selection
+from pup.diagnosis import exchanges, retracing, selection
 from pup.diagnosis.evidence import Projector, Trace
 from pup.diagnosis.exchanges import Exchanger
 from pup.diagnosis.fit import Fit
@@ -49,6 +49,7 @@ class Made(Exchanger):
         self.noise, self.enough = MAKER.noise, ENOUGH
         self.worths, self.unfit = worths, unfit
         self.nominal = made((), 1000.0)
+        self.traces: Any = SimpleNamespace(around=nothing)
 
     def models(self, fitted: Sequence[Tried]) -> list[Model]:
         return [made(known, self.worths[known]) for known, _ in fitted]
@@ -212,20 +213,19 @@ def one_group(robot: RobotDescription) -> RobotDescription:
 def test_an_effect_that_was_given_up_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there are more hypotheses than are simulated again around each model."""
     for name in ("LEADING", "MOST"):
-        monkeypatch.setattr(selection, name, 3)
+        monkeypatch.setattr(retracing, name, 3)
 
     def traces(asked: Sequence[Hypothesis], fit: Fit, *more: object) -> list[Trace]:
         return [MAKER.trace(h, Projector(fit.slopes)) for h in asked]
 
-    monkeypatch.setattr(selection, "traces", traces)
+    monkeypatch.setattr(retracing, "traces", traces)
     nominal, with_first, with_rival = (
         MAKER.model(known, error) for known, error in ((None, 3.0), (FIRST, 2.0), (RIVAL, 1.0))
     )
-    selector = Made({})
-    selector.base, selector._seen = nominal.fit, {}
-    selector.found = tuple(traces(hypotheses(MAKER.measured), nominal.fit))
-    assert FIRST.key not in {t.hypothesis.key for t in selector._traces(with_first)}
-    assert FIRST.key in {t.hypothesis.key for t in selector._traces(with_rival)}
+    found = traces(hypotheses(MAKER.measured), nominal.fit)
+    retracer = retracing.Retracer(Made({}).replays, MAKER.noise, found, nominal.fit)
+    assert FIRST.key not in {t.hypothesis.key for t in retracer.around(with_first)}
+    assert FIRST.key in {t.hypothesis.key for t in retracer.around(with_rival)}
 
 
 def test_a_fold_that_diverged_is_as_far_off_wherever_it_is() -> None:
@@ -263,7 +263,6 @@ def test_no_round_begins_where_the_form_of_what_was_found_may_leave_all_that_is_
     asked: list[object] = []
     monkeypatch.setattr(selection, "scores", lambda *told: asked.append(told) or [])
     monkeypatch.setattr(selection, "unimitated", nothing)
-    monkeypatch.setattr(Made, "_traces", nothing)
     samples = MAKER.samples
 
     def off(by: float, *told: Hypothesis) -> Model:

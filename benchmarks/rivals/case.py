@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.document import document
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.models import Model
@@ -18,6 +17,7 @@ from pup.diagnosis.nominal import Nominal, certified, fit_nominal
 from pup.diagnosis.pieces import pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.verdict import Alternative, Finding
 from pup.physics.parameters import robot_space

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.held_out import HeldOut
 from pup.diagnosis.laws import contract_name
 from pup.diagnosis.regimes import Window
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.verdict import Alternative, Finding
 from pup.diagnosis.wording import SLIDING
 from pup.physics.terms import TERMS, Term

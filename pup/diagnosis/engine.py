@@ -1,14 +1,12 @@
 """The whole diagnosis: from recordings to what the simulator leaves out."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.discover import Unexplained, beside, unexplained
-from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import (
     NextRecording,
     next_recording,
@@ -19,8 +17,16 @@ from pup.diagnosis.experiment import (
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import complete, differentiate, fit_together
 from pup.diagnosis.held_out import HeldOut, held_out
-from pup.diagnosis.hypotheses import Hypothesis
-from pup.diagnosis.locate import MissingInput, missing_input
+from pup.diagnosis.locate import missing_input
+from pup.diagnosis.looks import (
+    FirstLook,
+    drags,
+    first_look,
+    followed,
+    followed_well,
+    in_the_air,
+    nowhere,
+)
 from pup.diagnosis.materiality import improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.noise import assumed_noise, quiet_noise, told_anew
@@ -31,19 +37,10 @@ from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Replays, Runner
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.search import (
-    Search,
-    carried,
-    drags,
-    followed,
-    followed_well,
-    in_the_air,
-    nowhere,
-    search,
-    search_on,
-)
+from pup.diagnosis.result import Diagnosis
+from pup.diagnosis.search import Search, carried, search, search_on
 from pup.diagnosis.selection import Selector
-from pup.diagnosis.splits import Split, splits
+from pup.diagnosis.splits import splits
 from pup.diagnosis.verdict import Answer, Finding, findings, in_order
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space
@@ -58,61 +55,68 @@ ALONE = 0.5
 that has no name is told though no law of it predicts motions left out."""
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """What was found, and all that it was found from.
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What all stages of a diagnosis share.
 
     Attributes:
-      robot: the robot.
-      verdict: whether something material is missing.
-      reason: why nothing can be said, or what was found and does not matter; else empty.
-      measured: the samples.
-      nominal: the nominal fit.
-      findings: what is missing, most important first.
-      held_out: errors on motions left out, before and after.
-      before: the nominal model with what it predicts of motions left out.
-      model: the same with what was found.
-      rounds: how it came about.
-      found: traces of all hypotheses.
-      enough: surprise that chance does not reach.
-      regimes: the regimes of motion.
-      replays: candidates simulated.
-      ask: what to record next; None where nothing is open, or nothing would settle it.
-      missing: the torques that the nominal model lacks; None where nothing is to be explained.
-      unexplained: what the known effects leave; None where that is noise.
-      slight: effects that were found and do not matter.
-      origins: of parts of one recording, that recording's id and when in it each begins, s.
-      lost: recordings that were left out, as nothing found in the others makes them follow.
-      splits: how the nominal model's parameters differ between halves of the data, and how those
-        of the model with what was found.
+      recordings: as they were given.
+      parts: the same, or the parts of one that is alone.
+      measured: the samples of these.
+      replays: simulates them.
+      runner: makes what runs batches of replays.
+      lanes: how many run at once.
+      progress: told the stage and the share of all that is done.
+      seed: of everything random.
+      effects: that are looked for at most.
+      rng: drawn from so far.
     """
 
-    robot: RobotDescription
-    verdict: Answer
-    reason: str
+    recordings: Sequence[Recording]
+    parts: Sequence[Recording]
     measured: Measured
-    nominal: Nominal
-    findings: tuple[Finding, ...]
-    held_out: HeldOut | None
-    model: Model | None
-    rounds: tuple[Round, ...]
-    found: tuple[Trace, ...]
-    enough: float
-    regimes: tuple[Regime, ...]
-    replays: int
-    before: Model | None = None
-    ask: NextRecording | None = None
-    missing: MissingInput | None = None
-    unexplained: Unexplained | None = None
-    slight: tuple[Hypothesis, ...] = ()
-    origins: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
-    lost: tuple[str, ...] = ()
+    replays: Replays
+    runner: Callable[[Measured], Runner]
+    lanes: int
+    progress: Progress
+    seed: int
+    effects: int
+    rng: np.random.Generator
 
     @property
-    def noise(self) -> Noise:
-        """The noise of the channels."""
-        return self.nominal.noise
+    def contact(self) -> bool:
+        """Whether the robot stands on the ground in any of the recordings."""
+        return bool(self.measured.grounded.any())
+
+    def replays_of(self, measured: Measured) -> Replays:
+        """What simulates other samples, as of recordings that are planned."""
+        return Replays(measured, self.replays.space, self.runner(measured), self.lanes)
+
+    def look(self, kept: Sequence[int]) -> FirstLook | None:
+        """What some of the recordings show."""
+        return first_look(kept, self.replays, self.rng, self.progress, self.effects)
+
+    def search(
+        self, nominal: Nominal, first: FirstLook | None, base: Fit | None = None
+    ) -> Search | None:
+        """What all recordings show, from what a first look has found on."""
+        known = first.search if first else None
+        return search(self.replays, nominal, self.rng, self.progress, known, self.effects, base)
+
+    def told(
+        self, nominal: Nominal, regimes: Sequence[Regime], verdict: Answer, reason: str = ""
+    ) -> Diagnosis:
+        """A diagnosis that says so much and no more."""
+        return Diagnosis(
+            robot=self.measured.robot,
+            verdict=verdict,
+            reason=reason,
+            measured=self.measured,
+            nominal=nominal,
+            regimes=tuple(regimes),
+            replays=self.replays.count,
+            origins=origins(self.recordings, self.parts),
+        )
 
 
 def diagnose(
@@ -139,128 +143,105 @@ def diagnose(
     parts = pieces(recordings)
     measured = Measured.of(robot, parts)
     replays = Replays(measured, robot_space(robot, "pd"), runner(measured), lanes)
+    task = _Task(recordings, parts, measured, replays, runner, lanes, progress, seed, effects, rng)
     progress("nominal fit", 0.0)
     poor, noise = why_poor(measured), assumed_noise(measured)
     nominal = unfitted(replays, noise) if poor else fit_nominal(replays, noise, rng)
     seen = _regimes(nominal, replays)
 
-    def told(verdict: Answer, reason: str = "", **more: Any) -> Diagnosis:
-        known: dict[str, Any] = {
-            "findings": (),
-            "held_out": None,
-            "model": None,
-            "rounds": (),
-            "found": (),
-            "enough": 0.0,
-        }
-        if verdict == "undetermined":
-            known["ask"] = _instead(measured, poor, seed)
-        return Diagnosis(
-            robot=robot,
-            verdict=verdict,
-            reason=reason,
-            measured=measured,
-            nominal=nominal,
-            regimes=tuple(seen),
-            replays=replays.count,
-            origins=origins(recordings, parts),
-            **(known | more),
-        )
+    def undetermined(reason: str) -> Diagnosis:
+        ask = _instead(measured, poor, seed)
+        return replace(task.told(nominal, seen, "undetermined", reason), ask=ask)
 
     if poor:
-        return told("undetermined", poor.reason)
-    first = _first_look(followed(nominal, replays), replays, rng, progress, effects)
-    contact = bool(measured.grounded.any())
-    if first is None or contact:
-        nominal = certified(nominal, replays, rng)
-    if first is None and not nominal.certificate.holds:
-        near = in_the_air(measured) or followed_well(nominal, replays)
-        first = _first_look(near, replays, rng, progress, effects)
-    if first is not None:
-        whole, part = nominal.certificate, first[0].certificate
-        nominal = replace(nominal, certificate=part.beside(whole) if contact else part)
+        return undetermined(poor.reason)
+    nominal, first = _settled(task, nominal)
     if not nominal.certificate.holds:
-        return told("undetermined", _unsettled(nominal))
-    done = search(replays, nominal, rng, progress, first[1] if first else None, effects)
-    if done is not None and not contact:
-        if first is None and nowhere(done, nominal):
-            # Around a motion that is far off no slope shows what is missing, though none is lost.
-            first = _first_look(followed_well(nominal, replays), replays, rng, progress, effects)
-            base = carried(first[1], replays, nominal) if first else nominal.fit
-            if first is not None and base is not nominal.fit:
-                again = search(replays, nominal, rng, progress, first[1], effects, base)
-                done = min((s for s in (done, again) if s), key=lambda s: s.model.worth)
-        if first is not None and drags(first[1], done):
-            kept = first[1].selector.replays.measured.recordings
-            some = diagnose(robot, kept, runner, lanes, progress, seed, effects)
-            if some.verdict == "mismatch":  # of the others alone, nothing else may be said
-                left_out = {r.id for r in measured.recordings} - {r.id for r in kept}
-                lost = tuple(sorted({*some.lost, *left_out}))
-                return replace(some, lost=lost, replays=some.replays + replays.count)
-    if done is not None and nominal.noise.source == "assumed":
-        nominal, done = _weighed(nominal, done, replays, rng, progress, effects)
+        return undetermined(_unsettled(nominal))
+    done = task.search(nominal, first)
+    if done is not None and not task.contact:
+        done, first = _looked_again(task, nominal, first, done)
+        alone = _others_alone(task, first, done)
+        if alone is not None:
+            return alone
     if done is None:
-        return told("undetermined", "the motions would not show any effect of the library")
-    selector = done.selector
-    settled, rounds = selector.settled(done.model, done.rounds)
-    progress("what is left", 0.8)
-    model = selector.predicting(settled)
-    left = unexplained(model, selector, seen)
-    final = selector.predicting(left.model if left else model)
-    shown = held_out(measured, selector.nominal, final, seed)
-    slight, evidence = "", dict[str, Any]()
-    if not _matters(selector.nominal, model, left, shown, nominal.noise):
-        slight, evidence["slight"] = little(model, shown), model.hypotheses
-        left, model = None, selector.nominal
-        final = model
-        shown = held_out(measured, model, model, seed)
-    evidence |= {
-        "found": done.found,
-        "enough": done.enough,
-        "rounds": tuple(rounds),
-        "held_out": shown,
-        "before": selector.nominal,
-        "model": final,
-        "unexplained": left,
-    }
-    odd = unrepeated(measured, replays.errors(final.fit.row()), nominal.noise, seen)
-    if not model.hypotheses and not left and not odd:
-        return told("none", slight, **evidence)
-    progress("where", 0.87)
-    differentiate([final.fit], replays, nominal.noise)
-    evidence["missing"] = missing_input(nominal.fit, replays, nominal.noise)
-    evidence["splits"] = tuple(
-        splits(fit, replays, nominal.noise) for fit in (nominal.fit, final.fit)
+        return undetermined("the motions would not show any effect of the library")
+    if nominal.noise.source == "assumed":
+        nominal, done = _weighed(task, nominal, done)
+    return _judged(task, nominal, done, seen)
+
+
+def _settled(task: _Task, nominal: Nominal) -> tuple[Nominal, FirstLook | None]:
+    """A nominal fit with its certificate, and what motions show that must be looked at first.
+
+    These are the motions that it does not lose track of, or, where no fit to all of them can be
+    trusted, those in the air, or those that are followed best.
+    """
+    replays = task.replays
+    first = task.look(followed(nominal, replays))
+    if first is None or task.contact:
+        nominal = certified(nominal, replays, task.rng)
+    if first is None and not nominal.certificate.holds:
+        first = task.look(in_the_air(task.measured) or followed_well(nominal, replays))
+    if first is not None:
+        whole, part = nominal.certificate, first.nominal.certificate
+        trusted = part.beside(whole) if task.contact else part
+        nominal = replace(nominal, certificate=trusted)
+    return nominal, first
+
+
+def _looked_again(
+    task: _Task, nominal: Nominal, first: FirstLook | None, done: Search
+) -> tuple[Search, FirstLook | None]:
+    """A search made anew from what is followed best, where that of all motions has led nowhere.
+
+    Around a motion that is far off no slope shows what is missing, though none is lost.
+    """
+    if first is not None or not nowhere(done, nominal):
+        return done, first
+    first = task.look(followed_well(nominal, task.replays))
+    if first is None:
+        return done, None
+    base = carried(first.search, task.replays, nominal)
+    if base is nominal.fit:
+        return done, first
+    again = task.search(nominal, first, base)
+    return min((s for s in (done, again) if s), key=lambda s: s.model.worth), first
+
+
+def _others_alone(task: _Task, first: FirstLook | None, done: Search) -> Diagnosis | None:
+    """The diagnosis without the motions that keep all others from being followed.
+
+    None where there are none, or where the others alone show no mismatch: of them alone nothing
+    else may be said.
+    """
+    if first is None or not drags(first.search, done):
+        return None
+    kept = first.search.selector.replays.measured.recordings
+    some = diagnose(
+        task.measured.robot,
+        kept,
+        task.runner,
+        task.lanes,
+        task.progress,
+        task.seed,
+        task.effects,
     )
-    progress("findings", 0.92)
-    named = findings(model, rounds, selector, measured, seen) if model.hypotheses else ()
-    progress("next recording", 0.95)
-    ask = _next(named, rounds, selector, lambda m: Replays(m, replays.space, runner(m), lanes))
-    nameless = beside(left.finding, named, robot) if left else odd
-    evidence["findings"] = in_order((*named, nameless) if nameless else named)
-    return told("mismatch", ask=ask, **evidence)
+    if some.verdict != "mismatch":
+        return None
+    left_out = {r.id for r in task.measured.recordings} - {r.id for r in kept}
+    lost = tuple(sorted({*some.lost, *left_out}))
+    return replace(some, lost=lost, replays=some.replays + task.replays.count)
 
 
-def _instead(measured: Measured, poor: Poor | None, seed: int) -> NextRecording:
-    """What to record where these recordings tell nothing."""
-    cure = poor.cure if poor else ""
-    return recorded_again(measured, cure) if cure else recorded_besides(measured, seed)
-
-
-def _weighed(
-    nominal: Nominal,
-    done: Search,
-    replays: Replays,
-    rng: np.random.Generator,
-    progress: Progress,
-    effects: int,
-) -> tuple[Nominal, Search]:
+def _weighed(task: _Task, nominal: Nominal, done: Search) -> tuple[Nominal, Search]:
     """The search gone on with where what it leaves is not the noise that it was weighed by.
 
     With nothing recorded twice, noise is first taken from how errors flicker at rest, of which
     there may be little.
     """
-    measured, errors = replays.measured, replays.errors(done.model.fit.row())
+    measured, replays = task.measured, task.replays
+    errors = replays.errors(done.model.fit.row())
     noise = told_anew(nominal.noise, quiet_noise(measured, errors), measured)
     if noise is None:
         return nominal, done
@@ -270,7 +251,80 @@ def _weighed(
     certificate = nominal.certificate
     left = certificate.left * fit.chi2 / nominal.fit.chi2
     nominal = Nominal(fit, noise, replace(certificate, left=left))
-    return nominal, search_on(done, replays, nominal, rng, progress, effects)
+    return nominal, search_on(done, replays, nominal, task.rng, task.progress, task.effects)
+
+
+def _judged(task: _Task, nominal: Nominal, done: Search, seen: Sequence[Regime]) -> Diagnosis:
+    """The verdict on what a search has found: whether it is material, and what is left."""
+    measured, selector = task.measured, done.selector
+    settled, rounds = selector.settled(done.model, done.rounds)
+    task.progress("what is left", 0.8)
+    model = selector.predicting(settled)
+    left = unexplained(model, selector, seen)
+    final = selector.predicting(left.model if left else model)
+    shown = held_out(measured, selector.nominal, final, task.seed)
+    reason, slight = "", model.hypotheses[:0]
+    if not _matters(selector.nominal, model, left, shown, nominal.noise):
+        reason, slight = little(model, shown), model.hypotheses
+        left, model = None, selector.nominal
+        final = model
+        shown = held_out(measured, model, model, task.seed)
+    odd = unrepeated(measured, task.replays.errors(final.fit.row()), nominal.noise, list(seen))
+    told = replace(
+        task.told(nominal, seen, "none", reason),
+        found=done.found,
+        enough=done.enough,
+        rounds=tuple(rounds),
+        held_out=shown,
+        before=selector.nominal,
+        model=final,
+        unexplained=left,
+        slight=slight,
+    )
+    if not model.hypotheses and not left and not odd:
+        return told
+    return _explained(task, told, model, selector, odd)
+
+
+def _explained(
+    task: _Task, told: Diagnosis, model: Model, selector: Selector, odd: Finding | None
+) -> Diagnosis:
+    """A mismatch with all that is told of it: where, what, and what to record next.
+
+    Args:
+      task: of which diagnosis.
+      told: what is known of it.
+      model: the effects of the library that were found.
+      selector: which found them.
+      odd: a joint that does not repeat.
+    """
+    nominal, replays, seen, left = told.nominal, task.replays, told.regimes, told.unexplained
+    assert told.model is not None
+    task.progress("where", 0.87)
+    differentiate([told.model.fit], replays, nominal.noise)
+    missing = missing_input(nominal.fit, replays, nominal.noise)
+    before, after = (splits(fit, replays, nominal.noise) for fit in (nominal.fit, told.model.fit))
+    task.progress("findings", 0.92)
+    named = findings(model, told.rounds, selector, task.measured, seen) if model.hypotheses else ()
+    task.progress("next recording", 0.95)
+    ask = _next(named, told.rounds, selector, task.replays_of)
+    nameless = beside(left.finding, named, told.robot) if left else odd
+    return replace(
+        told,
+        verdict="mismatch",
+        reason="",
+        missing=missing,
+        splits=(before, after),
+        findings=in_order((*named, nameless) if nameless else named),
+        ask=ask,
+        replays=replays.count,
+    )
+
+
+def _instead(measured: Measured, poor: Poor | None, seed: int) -> NextRecording:
+    """What to record where these recordings tell nothing."""
+    cure = poor.cure if poor else ""
+    return recorded_again(measured, cure) if cure else recorded_besides(measured, seed)
 
 
 def _matters(
@@ -284,27 +338,6 @@ def _matters(
     if left.excess > ALONE:
         return True
     return improves(model, shown, noise) if model.hypotheses else shown.interval[0] > 0
-
-
-def _first_look(
-    kept: Sequence[int],
-    replays: Replays,
-    rng: np.random.Generator,
-    progress: Progress,
-    effects: int,
-) -> tuple[Nominal, Search] | None:
-    """What is missing in some of the recordings, where a fit to all of them tells little.
-
-    None where there are none of these, or their nominal fit does not converge either.
-    """
-    if not kept:
-        return None
-    some = replays.narrowed(kept)
-    fitted = certified(fit_nominal(some, assumed_noise(some.measured), rng), some, rng)
-    holds = fitted.certificate.holds
-    found = search(some, fitted, rng, progress, most=effects) if holds else None
-    replays.simulated += some.simulated
-    return None if found is None else (fitted, found)
 
 
 def _next(

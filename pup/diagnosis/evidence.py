@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis
 
 Array = NDArray[np.float64]
@@ -177,3 +178,9 @@ def _as_of_one(statistic: Array, freedom: int) -> Array:
 def overlap(a: Trace, b: Trace) -> float:
     """Share of one trace's direction that another can imitate, 0 to 1, at their typical sizes."""
     return float(np.linalg.norm(a.basis.T @ b.basis, 2)) if a.basis.size and b.basis.size else 0.0
+
+
+def unimitated(fit: Fit) -> Array:
+    """What a fit leaves that none of its own coordinates can imitate, shape (n_samples,)."""
+    assert fit.residual is not None
+    return Projector(fit.slopes)(fit.residual[:, None])[:, 0]

@@ -19,9 +19,9 @@ from pup.diagnosis import (
     summary,
 )
 from pup.diagnosis.drawing import draw_robot
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS, WORDS
 from pup.diagnosis.report_findings import badge, otherwise
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.rivals import Rivals
 from pup.diagnosis.sentences import items
 from pup.diagnosis.verdict import SLIGHT

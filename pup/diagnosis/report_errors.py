@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from pup.diagnosis import summary
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures import (
     COLOURS,
     Traced,
@@ -16,6 +15,7 @@ from pup.diagnosis.figures import (
     window,
 )
 from pup.diagnosis.folds import fold_words
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.summary import View
 from pup.diagnosis.wording import Speech, capital, percent, spoken
 from pup.sysid.figures import INK, SOFT

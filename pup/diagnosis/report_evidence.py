@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis import summary
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.evidence import Score
 from pup.diagnosis.figures import gains, likeness, masking, ranking_bars
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.models import Round
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.search import FALSE_ALARMS
 from pup.diagnosis.wording import (
     Speech,

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping
 
 from pup.diagnosis.drawing import MARKS
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.sentences import sentence
 from pup.diagnosis.verdict import Finding
 from pup.diagnosis.wording import Speech, percent, quantity_words

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from pup.diagnosis import summary
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.folds import fold_words
 from pup.diagnosis.nominal import SELF
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.wording import Speech, capital, change, digits, parameter_words
 from pup.physics.terms import split_column
 from pup.sysid.html import Column, Html, table, tag

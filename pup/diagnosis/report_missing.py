@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from pup.diagnosis import summary
 from pup.diagnosis.discover import EVIDENCE
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures_missing import Pushed, torque_ranking, torque_window
 from pup.diagnosis.locate import BAND, MissingInput
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.wording import Speech, digits, minus, percent
 from pup.physics.model import compile_model
 from pup.sysid.html import Column, Html, figure, table, tag

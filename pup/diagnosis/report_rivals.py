@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping
 
 from pup.diagnosis import summary
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures_rivals import rival_dots
 from pup.diagnosis.folds import fold_words
 from pup.diagnosis.residuals import Measured
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.rivals import DIAGNOSED, NETWORK, NN_PD, NOMINAL, Errors, Rivals
 from pup.diagnosis.wording import Speech, capital, minus, percent, spoken
 from pup.sysid.html import Column, Html, figure, table, tag

@@ -7,8 +7,8 @@ import numpy as np
 from scipy import stats
 
 from pup.diagnosis import summary
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.figures_missing import Interval, ratio_dots
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.splits import Ratio, Split
 from pup.diagnosis.wording import Speech, digits, parameter_words, percent, spoken
 from pup.sysid.html import Html, figure, tag

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pup.diagnosis.discover import Unexplained
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.lacks import Lack
 from pup.diagnosis.report_missing import lacking
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.summary import described
 from pup.diagnosis.wording import Speech, percent
 from pup.physics.terms import Place

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
+from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced, unimitated
 from pup.diagnosis.exchanges import RIVALS
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import Measured, Noise
-from pup.diagnosis.selection import Selector, unimitated
+from pup.diagnosis.selection import Selector
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.diagnosis.coordinates import Coordinate, nominal_coordinate
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Measured
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.selection import Selector
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace
 from pup.robot import NetworkOptions

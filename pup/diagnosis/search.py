@@ -1,10 +1,4 @@
-"""The search for what is missing: from the nominal fit to a model that holds.
-
-A motion that the nominal model loses track of, such as a limb that swings freely after the torque
-went off, says nothing by its slopes: errors of a radian are not small. It would also drag the
-nominal parameters with it. What is missing is then looked for in the other motions first, and the
-search goes on with all of them from what was found there.
-"""
+"""The search for what is missing: from the nominal fit to a model that holds."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,27 +17,13 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
 from pup.diagnosis.selection import full
-from pup.diagnosis.starts import LOUD, closely, puzzling
+from pup.diagnosis.starts import closely
 from pup.diagnosis.tracing import traces
-from pup.physics.terms.scale import Scale
 
 Array = NDArray[np.float64]
 
 FALSE_ALARMS = 0.002
 """Chance that pure noise makes any hypothesis stand out."""
-ASTRAY, FAR = 0.5, 0.2
-"""A motion is lost where a joint or the torso is off by this share of what it moves, and by so
-much, rad."""
-LEFT = 1 / 3
-"""Share of all recordings that must be left for a first look."""
-WELL = 4.0
-"""A recording is followed well whose mean squared error is so many times that of the best third at
-most."""
-QUIET = 1.5
-"""A model that leaves less than so many times the noise may be of all that is missing."""
-DRAGGED = 2.0
-"""A model of all recordings follows some worse than one of these alone does, where what it leaves
-beyond the noise is so many times as much, or so many times the noise."""
 HALFWAY = 3
 """So many effects found are half of what refits do, as far as anybody can know."""
 
@@ -100,7 +80,7 @@ def search(
         return None
     enough = max(threshold(found, rng, FALSE_ALARMS), nominal.certificate.left)
     told = _teller(progress)
-    near = None if first is None else _looked_at(first, replays.measured)
+    near = None if first is None else looked_at(first, replays.measured)
     selector = Exchanger(replays, nominal.noise, found, enough, nominal.fit, base, most, told, near)
     progress("refits", 0.5)
     before: tuple[Round, ...] = ()
@@ -140,9 +120,9 @@ def search_on(
         fit = turned.fit(done.model.fit)
         closely([fit], replays, nominal.noise)
         complete([fit], replays, nominal.noise)
-    near = done.selector.base is done.model.fit
+    near = done.selector.traces.base is done.model.fit
     own = {h.key for h in known}
-    others = (t for t in done.selector.found if t.hypothesis.key not in own)
+    others = (t for t in done.selector.traces.found if t.hypothesis.key not in own)
     latest = [*turned.traces(others, fit), *(t for t in found if t.hypothesis.key in own)]
     around = fit if near else base
     told = _teller(progress)
@@ -210,29 +190,9 @@ def extended(known: Fit, whole: Fit) -> Fit:
     )
 
 
-def nowhere(done: Search, nominal: Nominal) -> bool:
-    """Whether a search has led nowhere: what it leaves is many times the noise, or half of all."""
-    model = done.model
-    loudness = model.fit.chi2 / model.samples
-    little = puzzling(nominal.fit, [(model.hypotheses, model.fit)])
-    return loudness > LOUD or (little and loudness > QUIET)
-
-
-def drags(first: Search, done: Search) -> bool:
-    """Whether some recordings keep a model of all from following what a first look's model follows.
-
-    What is missing there is not what was found, and makes up for it in all the others.
-    """
-    residual = done.model.fit.residual
-    assert residual is not None
-    inside = residual[_looked_at(first, done.model.measured)]
-    own = max(first.model.fit.chi2 - first.model.samples, first.model.samples)
-    return bool(first.model.hypotheses) and float(np.sum(inside**2 - 1)) > DRAGGED * own
-
-
 def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
     """Traces of a first look, as if the motions that it left out showed nothing."""
-    inside = _looked_at(first, replays.measured)
+    inside = looked_at(first, replays.measured)
     project = Projector(base.slopes)
 
     def widened(trace: Trace) -> Trace | None:
@@ -243,63 +203,7 @@ def _seen_first(first: Search, base: Fit, replays: Replays) -> list[Trace]:
     return [trace for trace in map(widened, first.found) if trace is not None]
 
 
-def _looked_at(first: Search, measured: Measured) -> NDArray[np.bool_]:
+def looked_at(first: Search, measured: Measured) -> NDArray[np.bool_]:
     """The samples of the recordings of a first look."""
     looked = {recording.id for recording in first.selector.replays.measured.recordings}
     return measured.only([i for i, r in enumerate(measured.recordings) if r.id in looked])
-
-
-def followed(nominal: Nominal, replays: Replays) -> list[int]:
-    """The recordings that the nominal model does not lose track of.
-
-    Empty where it loses none, or where too few are left for a first look.
-    """
-    measured = replays.measured
-    errors = replays.errors(nominal.fit.row())
-    errors = np.where(np.isnan(errors), np.inf, errors)
-    every = range(len(measured.recordings))
-    kept = [i for i in every if not _lost(measured, errors, measured.only([i]))]
-    return kept if _worth_a_look(measured, kept) else []
-
-
-def followed_well(nominal: Nominal, replays: Replays) -> list[int]:
-    """The recordings that the nominal model is least off in, next to their noise.
-
-    Empty where it is off as much in nearly all, or where too few are left for a first look.
-    """
-    residual, measured = nominal.fit.residual, replays.measured
-    assert residual is not None
-    count = len(measured.recordings)
-    own = [residual[measured.only([i])] ** 2 for i in range(count)]
-    off = [float(squares.mean()) if len(squares) else np.inf for squares in own]
-    best = sorted(off)[int(np.ceil(LEFT * count)) - 1]
-    kept = [i for i in range(count) if off[i] <= WELL * max(best, 1.0)]
-    return kept if _worth_a_look(measured, kept) else []
-
-
-def in_the_air(measured: Measured) -> list[int]:
-    """The recordings without contact, which makes a fit end in many a place.
-
-    Empty where there is no contact, or where too few are left for a first look.
-    """
-    kept = [i for i, r in enumerate(measured.recordings) if r.support != "ground"]
-    return kept if _worth_a_look(measured, kept) else []
-
-
-def _worth_a_look(measured: Measured, kept: Sequence[int]) -> bool:
-    """Whether these are some recordings, not all: a third of them, and two types of motion."""
-    types = {measured.recordings[i].motion for i in kept}
-    count = len(measured.recordings)
-    return LEFT * count <= len(kept) < count and len(types) > 1
-
-
-def _lost(measured: Measured, errors: Array, own: NDArray[np.bool_]) -> bool:
-    joints = len(measured.robot.joints)
-    for channel in range(measured.channels):
-        far = FAR * Scale.of(measured.robot).angle if channel < joints else FAR
-        here = own & (measured.channel == channel)
-        if here.any():
-            off = float(np.sqrt(np.mean(errors[here] ** 2)))
-            if off > max(far, ASTRAY * float(np.std(measured.values[here]))):
-                return True
-    return False

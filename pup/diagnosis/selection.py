@@ -5,7 +5,7 @@ parameters is not. Effects are added one by one, the best first, as long as they
 by more than chance and predict types of motion that were left out; then each is tried without.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.beginnings import nearer
 from pup.diagnosis.doubts import spare
-from pup.diagnosis.evidence import Projector, Score, Trace, foremost, scores, traced
+from pup.diagnosis.evidence import Score, Trace, foremost, scores, unimitated
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import complete, fit_together, start_best
 from pup.diagnosis.folds import folds, left_out, without_samples
@@ -23,6 +23,7 @@ from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
+from pup.diagnosis.retracing import Retracer
 from pup.diagnosis.shortlist import in_contact, shortlist, suspected
 from pup.diagnosis.starts import (
     Tried,
@@ -35,8 +36,7 @@ from pup.diagnosis.starts import (
     puzzling,
     started,
 )
-from pup.diagnosis.tracing import by_rank, traces
-from pup.physics.terms import Place
+from pup.diagnosis.tracing import traces
 
 Array = NDArray[np.float64]
 
@@ -47,13 +47,8 @@ HOPE = 0.5
 CLOSE, MARGIN = 4, 40.0
 """So many of other classes than the best one's are refitted to the end, if they are within so much
 chi-squared of it."""
-LEADING, MOST = 80, 400
-"""Hypotheses that are simulated again around a model that has an effect more: those that looked
-most like its errors before, and so many more where that was no guide."""
 REMEMBERED = 150
 """Scores of a later round that are kept until the end."""
-ALIKE = 0.8
-"""Least cosine of what a hypothesis leaves before and after, for the ranking to be a guide."""
 PLACES = 16
 """Places that all effects together may act at."""
 KEPT = 0.25
@@ -93,11 +88,10 @@ class Selector:
     ) -> None:
         self.replays = replays
         self.noise = noise
-        self.found, self.base = tuple(found), base or nominal
+        self.traces = Retracer(replays, noise, found, base or nominal)
         self.enough, self.most, self.told = enough, most, told
         self.followed = followed
         self.folds = folds(replays)
-        self._seen = {t.hypothesis.key: t.basis.shape[1] for t in self.found}
         self._lesser: tuple[Model | None, list[Fit]] = None, []
         self.nominal = self.predicting(self.model((), nominal))
 
@@ -162,7 +156,7 @@ class Selector:
         of_contact = any(map(in_contact, model.hypotheses))
         if of_contact and spare(model) < self.blur(model):
             return None  # all that is left may be the form of contact that was found
-        ranking = scores(self._traces(model), unimitated(fit))
+        ranking = scores(self.traces.around(model), unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
             return None
         tried = self._begun(model, ranking)
@@ -202,39 +196,6 @@ class Selector:
         found = traces(hypotheses(self.replays.measured), fit, self.replays, self.noise)
         ranking = scores(found, unimitated(fit))
         return ranking, self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
-
-    def _traces(self, model: Model) -> list[Trace]:
-        """Traces of what a model does not have, around it: a large effect changes all others'."""
-        known = {h.key for h in model.hypotheses}
-        if model.fit is not self.base:
-            rest = [h for h in hypotheses(self.replays.measured) if h.key not in known]
-            self.found = self._traced_anew(model.fit, rest)
-            self.base = model.fit
-            self._seen |= {t.hypothesis.key: t.basis.shape[1] for t in self.found}
-        return [t for t in self.found if t.hypothesis.key not in known]
-
-    def _traced_anew(self, fit: Fit, rest: Sequence[Hypothesis]) -> tuple[Trace, ...]:
-        """Traces around a fit; where there are many, those of the hopeless as they were.
-
-        So are those of what the fit has: an effect that is given up may be asked for again.
-        """
-        project = Projector(fit.slopes)
-        kept = {h.key for h in rest}
-        before = [t for t in self.found if t.hypothesis.key in kept]
-        known = [t for t in self.found if t.hypothesis.key not in kept]
-        around = (traced(t.hypothesis, t.whole, project) for t in before)
-        old = {t.hypothesis: t for t in around if t is not None}
-        place: dict[tuple[str, Place], int] = {}
-        for rank, score in enumerate(scores(list(old.values()), unimitated(fit))):
-            place.setdefault(score.trace.hypothesis.key, rank)  # by the best of its forms
-        ordered = by_rank(rest, place, self.replays.measured.robot)
-        leading = _whole(ordered, LEADING)
-        new = traces(leading, fit, self.replays, self.noise)
-        more = _whole(ordered, MOST)[len(leading) :]
-        if more and _changed(old, new) > 0.5:
-            leading, new = [*leading, *more], new + traces(more, fit, self.replays, self.noise)
-        again = {h.key for h in leading}
-        return (*new, *(t for t in old.values() if t.hypothesis.key not in again), *known)
 
     def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""
@@ -325,10 +286,6 @@ class Selector:
             model = self.ended(self.lesser(model, spare))
         return model
 
-    def _freedom(self, hypotheses: Sequence[Hypothesis]) -> int:
-        seen = self._seen
-        return sum(seen.get(h.key, len(h.magnitudes)) + len(h.continuous) for h in hypotheses)
-
     def models(self, fitted: Sequence[Tried]) -> list[Model]:
         """Fitted models with what each fold costs them by fits without it."""
         complete([fit for _, fit in fitted], self.replays, self.noise)
@@ -336,7 +293,7 @@ class Selector:
         return [
             Model(
                 hypotheses,
-                self._freedom(hypotheses),
+                self.traces.freedom(hypotheses),
                 fit,
                 np.array([left_out(fit, inside) for inside in insides]),
                 self.replays.measured,
@@ -383,22 +340,3 @@ def _remembered(
     if not model.hypotheses:
         return tuple(ranking)
     return tuple(foremost(ranking, REMEMBERED, {known[-1] for known, _ in tried}))
-
-
-def _whole(ordered: Sequence[Hypothesis], number: int) -> list[Hypothesis]:
-    """The first ones, each with all its forms."""
-    first = {h.key for h in ordered[:number]}
-    return [h for h in ordered if h.key in first]  # forms of one effect stand together
-
-
-def _changed(old: Mapping[Hypothesis, Trace], new: Sequence[Trace]) -> float:
-    """Share of traces that are not what they were."""
-    both = [(old[t.hypothesis].left, t.left) for t in new if t.hypothesis in old]
-    cosines = [np.vdot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)) for a, b in both]
-    return float(np.mean(np.array(cosines) < ALIKE)) if cosines else 1.0
-
-
-def unimitated(fit: Fit) -> Array:
-    """What a fit leaves that none of its own coordinates can imitate, shape (n_samples,)."""
-    assert fit.residual is not None
-    return Projector(fit.slopes)(fit.residual[:, None])[:, 0]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pup.diagnosis.engine import Diagnosis
 from pup.diagnosis.laws import NAMELESS, WORDS
+from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.summary import described
 from pup.diagnosis.verdict import Finding
 from pup.diagnosis.wording import Speech, capital, digits, effect_words, minus, percent

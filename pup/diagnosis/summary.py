@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.engine import Diagnosis
-from pup.diagnosis.evidence import Score, Trace, overlap, scores
+from pup.diagnosis.evidence import Score, Trace, overlap, scores, unimitated
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.gains import MATERIAL
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.regimes import Window, windows
-from pup.diagnosis.selection import KEPT, unimitated
+from pup.diagnosis.result import Diagnosis
+from pup.diagnosis.selection import KEPT
 from pup.diagnosis.verdict import WORTH_SAYING, Finding, probabilities
 from pup.physics.terms import Place
 from pup.recording import originals
