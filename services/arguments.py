@@ -9,7 +9,15 @@ from pup.usage import Usage
 from services.arguments_experiment import experiment
 from services.arguments_jobs import jobs, submit
 from services.arguments_policies import replay, serve, train, transfer, virtual_robot
-from services.arguments_recordings import blind, diagnose, export, import_logs, presysid, record
+from services.arguments_recordings import (
+    blind,
+    describe,
+    diagnose,
+    export,
+    import_logs,
+    presysid,
+    record,
+)
 from services.options import budget, number, out, place, robot_or_darwin
 
 NEGATIVE = re.compile(r"-[\d.][\d.eE+,-]*$")
@@ -31,6 +39,7 @@ def parser(
     verbs = whole.add_subparsers(title="verbs", required=True, dest="name", metavar="VERB")
     for name, told, fill in (
         ("run", "the whole job, stage by stage; run again, it resumes", _run),
+        ("describe", "draft a robot's folder from its MJCF or URDF", describe),
         ("import", "turn other people's logs into recordings", import_logs),
         ("export", "turn recordings, and replays of them, into other programs' files", export),
         ("record", "record scripted motions of a virtual robot, or script them", record),

@@ -18,6 +18,20 @@ from services.options import (
 )
 
 
+def describe(verb: argparse.ArgumentParser) -> None:
+    """Which model, and what it does not tell."""
+    verb.add_argument("model", type=Path, metavar="MODEL", help="MJCF or URDF")
+    out(verb, "robot.toml, model.xml and its meshes")
+    verb.add_argument(
+        "--name", dest="called", default="", help="of the robot; default: the model's"
+    )
+    verb.add_argument(
+        "--free",
+        action="store_true",
+        help="let a base that the model fixes move, with a floor below: URDF does not tell",
+    )
+
+
 def import_logs(verb: argparse.ArgumentParser) -> None:
     """What is read, and what the logs do not tell."""
     verb.add_argument(

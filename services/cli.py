@@ -122,6 +122,13 @@ def _show_life(shown: dict[str, Any]) -> None:
     print(f"{shown['robot']} lived for {shown['time']:.1f} s")
 
 
+def _show_draft(shown: dict[str, Any]) -> None:
+    joints, groups = len(shown["joints"]), ", ".join(shown["groups"])
+    print(f"{shown['folder']}: {shown['robot']}, {joints} joints in groups {groups}")
+    for note in shown["notes"]:
+        print(f"- {note}")
+
+
 def _show_files(shown: dict[str, Any]) -> None:
     for path in shown["files"]:
         print(path)
@@ -136,6 +143,7 @@ def _show_recordings(shown: dict[str, Any]) -> None:
 
 SHOWN = {
     "run": _show_job,
+    "describe": _show_draft,
     "import": _show_recordings,
     "export": _show_files,
     "record": _show_recordings,

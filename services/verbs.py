@@ -252,6 +252,21 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
         return {"recordings": [str(file) for file in files]}
 
 
+def _describe(options: argparse.Namespace) -> dict[str, Any]:
+    from pup.physics.draft import draft_robot
+
+    with _folder(options.out) as out:
+        drafted = draft_robot(options.model, out, options.called, options.free)
+    robot = drafted.robot
+    return {
+        "robot": robot.name,
+        "folder": str(options.out),
+        "joints": list(robot.joint_names),
+        "groups": list(robot.groups),
+        "notes": list(drafted.notes),
+    }
+
+
 def _export(options: argparse.Namespace) -> dict[str, Any]:
     from services.export import export
 
@@ -369,6 +384,7 @@ def _setup(given: Sequence[tuple[str, float]]) -> dict[str, float]:
 
 VERBS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "run": _run,
+    "describe": _describe,
     "import": _import,
     "export": _export,
     "record": _record,
