@@ -6,6 +6,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+def sole_of(foot: str) -> str:
+    """The site on a foot whose z axis is the sole's upward one, where the body's own is not."""
+    return f"{foot}_sole"
+
+
 def floor_normal(places: Array, axes: Array) -> Array:
     """The direction of the floor's normal as the feet tell it that stand on it, shape (3,).
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from hardware_agent.virtual.character import Character
 from pup.errors import InputError
 from pup.robot import RobotDescription
-from pup.robot_stance import floor_normal
+from pup.robot_stance import floor_normal, sole_of
 
 Array = NDArray[np.float64]
 
@@ -106,11 +106,20 @@ def standing(robot: RobotDescription, model: mujoco.MjModel, pose: Array) -> Arr
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
     feet = [model.body(foot).id for foot in robot.feet]
-    axes = data.xmat[feet].reshape(-1, 3, 3)[:, :, 2]
+    axes = np.array([_sole(model, data, foot) for foot in robot.feet])
     data.qpos[3:7] = _upright(floor_normal(data.xpos[feet], axes))
     mujoco.mj_kinematics(model, data)
     data.qpos[2] = CLEAR - _lowest(model, data, feet)
     return np.array(data.qpos)
+
+
+def _sole(model: mujoco.MjModel, data: mujoco.MjData, foot: str) -> Array:
+    """The upward axis of a foot's sole: of its site where there is one, or else of the body."""
+    for site in range(model.nsite):
+        on = model.body(model.site_bodyid[site]).name
+        if on == foot and model.site(site).name == sole_of(foot):
+            return np.asarray(data.site_xmat[site].reshape(3, 3)[:, 2])
+    return np.asarray(data.body(foot).xmat.reshape(3, 3)[:, 2])
 
 
 def _upright(up: Array) -> Array:

@@ -14,7 +14,7 @@ from pup.physics.rotations import CONJUGATE, multiply
 from pup.physics.stopwatch import put_away
 from pup.recording import Recording
 from pup.robot import RobotDescription
-from pup.robot_stance import floor_normal
+from pup.robot_stance import floor_normal, sole_of
 
 Array = NDArray[np.float64]
 Selection = slice | NDArray[np.int64]
@@ -331,10 +331,20 @@ def _feet_flat(robot: RobotDescription, model: mujoco.MjModel, data: mujoco.MjDa
     if not robot.feet:
         return np.array([1.0, 0, 0, 0])
     feet = [model.body(foot).id for foot in robot.feet]
-    up = floor_normal(data.xpos[feet], data.xmat[feet].reshape(-1, 3, 3)[:, :, 2])
+    axes = np.array([_sole(model, data, foot) for foot in robot.feet])
+    up = floor_normal(data.xpos[feet], axes)
     up /= np.linalg.norm(up)
     half = np.array([1 + up[2], up[1], -up[0], 0.0])  # shortest turn that takes `up` to z
     return np.asarray(half / np.linalg.norm(half))
+
+
+def _sole(model: mujoco.MjModel, data: mujoco.MjData, foot: str) -> Array:
+    """The upward axis of a foot's sole: of its site where there is one, or else of the body."""
+    body = model.body(foot).id
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, sole_of(foot))
+    told = site >= 0 and model.site_bodyid[site] == body
+    turn = data.site_xmat[site] if told else data.xmat[body]
+    return np.asarray(turn.reshape(3, 3)[:, 2])
 
 
 def lowest_point(model: mujoco.MjModel, places: Array, axes: Array) -> Array:
