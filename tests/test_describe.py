@@ -100,9 +100,9 @@ def test_a_fixed_base_stays_fixed(tmp_path: Path) -> None:
     assert any("--free" in note for note in drafted.notes)
 
 
-def stl(file: Path) -> None:
+def stl(file: Path, size: float = 0.02) -> None:
     """A tetrahedron, binary."""
-    corners = np.array([[0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02]], np.float32)
+    corners = np.array([[0, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]], np.float32)
     faces = [corners[[0, 2, 1]], corners[[0, 1, 3]], corners[[0, 3, 2]], corners[[1, 2, 3]]]
     body = b"".join(np.r_[np.zeros((1, 3)), f].astype("<f4").tobytes() + b"\0\0" for f in faces)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -157,7 +157,8 @@ def test_links_that_overlap_where_the_robot_stands_do_not_push_each_other(tmp_pa
       <body name="shin">{hinge}<geom size="0.03" pos="0 0 -0.11"/></body></body></body>
       </worldbody></mujoco>""")
     drafted = draft_robot(file, tmp_path / "tight")
-    assert "base and shin overlap, so that they do not touch" in drafted.notes
+    told = "made not to touch, as they overlap where it stands: base and shin"
+    assert told in drafted.notes
     assert compile_model(drafted.robot, "ground").compiled.nexclude == 1
 
 
@@ -187,7 +188,7 @@ def test_groups_are_told_by_names(name: str, group: str) -> None:
     [
         ("<robot name='r'><link name='a'/></robot>", "no hinge or slide joint"),
         ("<robot", "MuJoCo refuses it"),
-        (WALKER.replace('<sphere radius="0.02"/>', '<mesh filename="a.dae"/>'), "convert it"),
+        (WALKER.replace('<sphere radius="0.02"/>', '<mesh filename="a.stl"/>'), "is not there"),
     ],
 )
 def test_what_cannot_be_described_is_refused_in_a_line(
