@@ -100,7 +100,8 @@ def test_a_foot_that_leans_in_the_key_frame_keeps_its_axis(tmp_path: Path) -> No
 
 
 def test_a_floor_inside_a_body_moves_to_the_world(tmp_path: Path) -> None:
-    inside = f'<body name="ground" pos="0 0 -0.2">{FLOOR}</body>'
+    table = '<geom size="0.1" pos="1 0 -0.2"/>'  # not of the robot, which stands no higher for it
+    inside = f'<body name="ground" pos="0 0 -0.2">{FLOOR}{table}</body>'
     model, qpos = stood(drafted(tmp_path, biped(inside)).robot)
     floor = model.compiled.geom("floor")
     assert (floor.bodyid[0], floor.type[0]) == (0, mujoco.mjtGeom.mjGEOM_PLANE)
@@ -249,12 +250,13 @@ def test_what_is_not_of_the_robot_is_left_out(tmp_path: Path) -> None:
     cube = '<body name="cube"><freejoint/><geom size="0.02"/></body>'
     told = drafted(tmp_path / "arm", arm(world=cube))
     assert not told.robot.floating and "not of the robot, and left out: cube" in told.notes
+    cube += '<body name="goal" mocap="true"><geom size="0.1"/></body>'
     door = '<body name="door" pos="2 0 0"><joint name="hinge"/><geom size="0.1"/></body>'
     qpos = "0 0 1 1 0 0 0 0.3 0 0 0.4 1 0 0 0 0.5 0 0.2 0"
     key = f'<keyframe><key name="home" qpos="{qpos}"/></keyframe>'
     told = drafted(tmp_path / "biped", biped(FLOOR + cube + door, more=key))
     assert told.robot.torso == "base"
-    assert "not of the robot, and left out: cube, door" in told.notes
+    assert "not of the robot, and left out: cube, goal, door" in told.notes
     assert told.robot.poses["home"] == (0.5, 0, 0.2, 0)
 
 

@@ -46,7 +46,7 @@ def free_base(
     if torso is not None:  # the engine looks for the torso at the head of all that moves
         own = {torso.name, *(body.name for body in others)}
         trees = [body for body in spec.worldbody.bodies if body.name not in own]
-        others += [tree for tree in trees if any(below.joints for below in _below(tree))]
+        others += [t for t in trees if t.mocap or any(below.joints for below in _below(t))]
     if others:
         notes.append(f"not of the robot, and left out: {some([body.name for body in others])}")
     for body in others:

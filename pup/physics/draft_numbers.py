@@ -122,7 +122,9 @@ def limits_of(model: mujoco.MjModel, joint: int) -> tuple[float, float] | None:
     if not limits:
         return None
     low, high = np.max(limits, axis=0)[0], np.min(limits, axis=0)[1]
-    return (round(float(low), LIMIT), round(float(high), LIMIT)) if low < high else None
+    if low >= high:  # they have nothing in common
+        low, high = limits[0]
+    return round(float(low), LIMIT), round(float(high), LIMIT)
 
 
 def _servos(model: mujoco.MjModel, joint: int) -> list[int]:

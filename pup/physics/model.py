@@ -356,7 +356,8 @@ def lowest_point(model: mujoco.MjModel, places: Array, axes: Array) -> Array:
       axes: their rotation matrices, shape (..., n_geoms, 9): `geom_xmat`.
     """
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    geoms = np.flatnonzero(collides & (model.geom_bodyid != 0))
+    moves = model.body_weldid[model.geom_bodyid] != 0  # what is fixed to the world is not of it
+    geoms = np.flatnonzero(collides & moves)
     if not len(geoms):
         return np.zeros(places.shape[:-2])
     centre, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
