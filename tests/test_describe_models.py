@@ -102,9 +102,13 @@ def test_a_foot_that_leans_in_the_key_frame_keeps_its_axis(tmp_path: Path) -> No
 def test_a_floor_inside_a_body_moves_to_the_world(tmp_path: Path) -> None:
     table = '<geom size="0.1" pos="1 0 -0.2"/>'  # not of the robot, which stands no higher for it
     inside = f'<body name="ground" pos="0 0 -0.2">{FLOOR}{table}</body>'
-    model, qpos = stood(drafted(tmp_path, biped(inside)).robot)
+    more = """<contact><pair geom1="floor" geom2="left_sole"/></contact>
+      <default><geom contype="0" conaffinity="1"/></default>"""
+    model, qpos = stood(drafted(tmp_path, biped(inside, more=more)).robot)
     floor = model.compiled.geom("floor")
     assert (floor.bodyid[0], floor.type[0]) == (0, mujoco.mjtGeom.mjGEOM_PLANE)
+    assert floor.contype[0] == 1
+    assert floor.id in (model.compiled.pair_geom1[0], model.compiled.pair_geom2[0])
     assert qpos[2] == pytest.approx(-0.2 + 0.23, abs=1e-6)
 
 

@@ -66,29 +66,46 @@ def level_floor(spec: mujoco.MjSpec, model: mujoco.MjModel, notes: list[str]) ->
     geoms = {geom.id: geom for geom in spec.geoms if geom.id >= 0}  # others are for the eye
     flat = [g for g in geoms if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE]
     level = [g for g in flat if at.geom_xmat[g][8] >= LEVEL]
-    level.sort(key=lambda g: (model.geom_bodyid[g] != 0, model.geom(g).name != FLOOR))
-    height = float(at.geom_xpos[level[0]][2]) if level else 0.0
-    # A plane inside a body that stands still is level ground too, but the engine would take it for
-    # a part of the robot.
-    inside = [g for g in level if model.geom_bodyid[g] != 0]
-    floor = level[0] if level and level[0] not in inside else None
-    rough = [g for g in geoms if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD]
+    # The engine asks a floor how it lies, which one inside a body tells only of the body.
+    own = [g for g in level if model.geom_bodyid[g] == 0]
+    inside = [g for g in level if g not in own]
+    floor = next((g for g in own if geoms[g].name == FLOOR), own[0] if own else None)
+    taken = {geom.name for geom in geoms.values()}
+    for g, geom in geoms.items():
+        if geom.name == FLOOR and g != floor:
+            _rename(spec, geom, unique(f"{FLOOR}_too", taken))
+    if floor is None:
+        ground = _plane(spec, float(at.geom_xpos[inside[0]][2]) if inside else 0.0)
+    else:
+        ground = geoms[floor]
+        _rename(spec, ground, FLOOR)
+    ground.priority = 1
+    for g in inside:
+        _follow(spec, geoms[g].name, FLOOR)
+        spec.delete(geoms[g])
+    _leave_out_fields(spec, notes)
+
+
+def _plane(spec: mujoco.MjSpec, height: float) -> mujoco.MjsGeom:
+    """A new floor, m; the model's defaults may be of shapes that do not touch."""
+    return spec.worldbody.add_geom(
+        name=FLOOR,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[10.0, 10.0, 0.1],
+        pos=[0.0, 0.0, height],
+        contype=1,
+        conaffinity=1,
+    )
+
+
+def _leave_out_fields(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    rough = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD]
     if rough:
         notes.append("the floor is level: the model's height fields are left out")
-    taken = {model.geom(g).name for g in geoms}
-    for g, geom in geoms.items():
-        if geom.name == FLOOR and g != floor and g not in inside:
-            _rename(spec, geom, unique(f"{FLOOR}_too", taken))
-    for g in inside:
-        _rename(spec, geoms[g], FLOOR)
-    for part in (*(geoms[g] for g in (*inside, *rough)), *spec.hfields):
-        spec.delete(part)
-    ground = spec.worldbody.add_geom() if floor is None else geoms[floor]
-    if floor is None:
-        ground.type, ground.size = mujoco.mjtGeom.mjGEOM_PLANE, [10.0, 10.0, 0.1]
-        ground.pos = [0.0, 0.0, height]
-    _rename(spec, ground, FLOOR)
-    ground.priority = 1
+    for geom in rough:
+        spec.delete(geom)
+    for field in list(spec.hfields):
+        spec.delete(field)
 
 
 def imu_site(spec: mujoco.MjSpec, model: mujoco.MjModel, torso: str, notes: list[str]) -> str:
@@ -209,6 +226,11 @@ def _driven(body: mujoco.MjsBody) -> bool:
 def _rename(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, name: str) -> None:
     """Rename a geom, also where a pair of geoms that may touch names it."""
     old, geom.name = geom.name, name
+    _follow(spec, old, name)
+
+
+def _follow(spec: mujoco.MjSpec, old: str, name: str) -> None:
+    """Let pairs of geoms name another one."""
     for pair in spec.pairs if old else ():
         pair.geomname1 = name if pair.geomname1 == old else pair.geomname1
         pair.geomname2 = name if pair.geomname2 == old else pair.geomname2
