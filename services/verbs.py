@@ -253,7 +253,7 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _describe(options: argparse.Namespace) -> dict[str, Any]:
-    from pup.physics.draft import draft_robot
+    from pup.drafting.draft import draft_robot
 
     with _folder(options.out) as out:
         drafted = draft_robot(options.model, out, options.called, options.free)

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pup.drafting.description import OTHER, group_of, partner
+from pup.drafting.draft import draft_robot
 from pup.errors import InputError
-from pup.physics.draft import draft_robot
 from pup.physics.model import compile_model, standing_qpos
 from pup.robot import RobotDescription
-from pup.robot_draft import OTHER, group_of, partner
 from services.cli import main
 
 QUADRUPED = Path(__file__).parents[1] / "examples" / "quadruped"

@@ -8,11 +8,11 @@ import pytest
 from test_describe import BOX, WALKER, link, stl, urdf
 
 from hardware_agent.virtual import skeleton
+from pup.drafting.description import group_of, groups_of, partner
+from pup.drafting.draft import Drafted, draft_robot
 from pup.errors import InputError
-from pup.physics.draft import Drafted, draft_robot
 from pup.physics.model import Model, compile_model, standing_qpos
 from pup.robot import RobotDescription
-from pup.robot_draft import group_of, groups_of, partner
 
 FLOOR = '<geom name="floor" type="plane" size="5 5 0.1"/>'
 LEG = """<body name="{side}_shin" pos="0 {y} -0.1"><joint name="{side}_knee" axis="0 1 0"

@@ -12,9 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.errors import InputError
-from pup.files import write_atomic
-from pup.physics.draft_base import (
+from pup.drafting.base import (
     add_soles,
     free_base,
     heavy_part,
@@ -23,13 +21,15 @@ from pup.physics.draft_base import (
     part_neighbours,
     standing,
 )
-from pup.physics.draft_files import take_along
-from pup.physics.draft_limbs import feet_of, mirror_map
-from pup.physics.draft_numbers import limits_of, parameters, servo_of
-from pup.physics.draft_spec import compiled, fitting, read_spec, refusals
+from pup.drafting.description import Draft, groups_of, written
+from pup.drafting.files import take_along
+from pup.drafting.limbs import feet_of, mirror_map
+from pup.drafting.numbers import limits_of, parameters, servo_of
+from pup.drafting.spec import compiled, fitting, read_spec, refusals
+from pup.errors import InputError
+from pup.files import write_atomic
 from pup.physics.model import compile_model
 from pup.robot import RobotDescription
-from pup.robot_draft import Draft, groups_of, written
 from pup.robot_parts import Joint
 from pup.robot_toml import NAME
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import mujoco
 
+from pup.drafting.files import find_files
 from pup.errors import InputError
-from pup.physics.draft_files import find_files
 from pup.robot_toml import NAME
 
 LEAST_INERTIA = 1e-9

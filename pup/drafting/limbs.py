@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.robot_draft import partner
+from pup.drafting.description import partner
 
 Array = NDArray[np.float64]
 

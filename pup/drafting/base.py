@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.drafting.description import words_of
+from pup.drafting.spec import of_type, some, unique
 from pup.errors import InputError
-from pup.physics.draft_spec import of_type, some, unique
 from pup.physics.model import FLOOR, LEVEL
 from pup.physics.rotations import CONJUGATE
-from pup.robot_draft import words_of
 from pup.robot_stance import sole_of
 
 Array = NDArray[np.float64]

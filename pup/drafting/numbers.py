@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from pup.physics.draft_limbs import height_of
-from pup.physics.draft_spec import BY_JOINT
+from pup.drafting.limbs import height_of
+from pup.drafting.spec import BY_JOINT
 from pup.robot_parts import ParameterSpec
 
 GRAVITY = 9.81

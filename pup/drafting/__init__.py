@@ -1,0 +1,1 @@
+"""A robot's folder drafted from the model that a laboratory has already."""
