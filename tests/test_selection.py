@@ -15,6 +15,7 @@ from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis, hypotheses
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.residuals import LOST
+from pup.diagnosis.shortlist import FINALISTS, FURTHER, shortlist
 from pup.diagnosis.starts import Tried
 from pup.diagnosis.verdict import probabilities
 from pup.physics.terms import Place
@@ -290,3 +291,29 @@ def test_a_motion_that_is_lost_hides_nothing_in_others(followed: bool) -> None:
     selector.nominal, selector.followed = off(250.0, 3.0), ~lost if followed else None
     assert selector._beyond_forms(off(5.0, 1.2), off(5.0, 1.0)) is followed
     assert not selector._beyond_forms(off(5.0, 1.2), off(4.9, 1.2))
+
+
+@pytest.mark.parametrize(("left", "looked"), [(50.0, True), (5.0, False)])
+def test_where_all_that_was_tried_leaves_many_times_the_noise_more_are_tried(
+    monkeypatch: pytest.MonkeyPatch, left: float, looked: bool
+) -> None:
+    """So far off slopes say little: the ninth of a ranking was the one that fitted."""
+    every = {h.key: h for h in hypotheses(MAKER.measured) if h.place == FIRST.place}
+    ranking: list[Any] = [
+        SimpleNamespace(surprise=1000.0 - i, trace=SimpleNamespace(hypothesis=h))
+        for i, h in enumerate(every.values())
+    ]
+    assert len(ranking) > FINALISTS + 4
+    fit = replace(MAKER.model(None, 1.0).fit, chi2=left * MAKER.samples)
+
+    def begun(self: Made, model: Model, chosen: Sequence[Any]) -> list[Any]:
+        return [((score.trace.hypothesis,), fit) for score in chosen]
+
+    monkeypatch.setattr(Made, "_begun", begun)
+    monkeypatch.setattr(Made, "_refit", nothing)
+    selector, model = Made({}), made((), 90.0 * MAKER.samples)
+    tried = begun(selector, model, shortlist(ranking, ENOUGH))
+    more = [known[-1] for known, _ in selector._further(model, ranking, tried)]
+    first = {known[-1] for known, _ in tried}
+    rest = [s.trace.hypothesis for s in ranking[:FURTHER] if s.trace.hypothesis not in first]
+    assert set(more) == (set(rest) if looked else set())

@@ -24,13 +24,15 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.retracing import Retracer
-from pup.diagnosis.shortlist import in_contact, shortlist, suspected
+from pup.diagnosis.shortlist import FURTHER, in_contact, shortlist, suspected
 from pup.diagnosis.starts import (
+    LIMB,
     Tried,
     begun_anew,
     closely,
     described,
     distinct,
+    glaring,
     less,
     options,
     puzzling,
@@ -159,8 +161,11 @@ class Selector:
         ranking = scores(self.traces.around(model), unimitated(fit))
         if not ranking or ranking[0].surprise < self.enough:
             return None
-        tried = self._begun(model, ranking)
+        contact = suspected(fit, self.replays.measured)
+        tried = self._begun(model, shortlist(ranking, self.enough, contact))
         self._refit(tried, fit.chi2)
+        if not model.hypotheses:
+            tried += self._further(model, ranking, tried)
         if not model.hypotheses and puzzling(fit, tried):
             more, elsewhere = self._elsewhere()
             ranked = {score.trace.hypothesis for score in ranking}
@@ -176,10 +181,25 @@ class Selector:
             holds[0] = self.ended(holds[0])
         return Round(model, told, (*holds, *others), len(holds))
 
-    def _begun(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
+    def _further(
+        self, model: Model, ranking: Sequence[Score], tried: Sequence[Tried]
+    ) -> list[Tried]:
+        """Fits further down the ranking, where all that was tried leaves many times the noise.
+
+        Not of whole robots, which have hundreds of hypotheses.
+        """
+        measured = self.replays.measured
+        left = min((fit.chi2 for _, fit in tried), default=model.fit.chi2)
+        if len(measured.robot.joints) > LIMB or not glaring(left, len(measured.values)):
+            return []
+        known = {effects[-1] for effects, _ in tried}
+        chosen = shortlist(ranking, self.enough, most=FURTHER)
+        more = self._begun(model, [s for s in chosen if s.trace.hypothesis not in known])
+        self._refit(more, model.fit.chi2)
+        return more
+
+    def _begun(self, model: Model, chosen: Sequence[Score]) -> list[Tried]:
         """Fits of a model with one effect more, each begun where it is best."""
-        contact = suspected(model.fit, self.replays.measured)
-        chosen = shortlist(ranking, self.enough, contact)
         tried = [
             ((*model.hypotheses, score.trace.hypothesis), started(model.fit, score))
             for score in chosen
@@ -195,7 +215,10 @@ class Selector:
             return [], []
         found = traces(hypotheses(self.replays.measured), fit, self.replays, self.noise)
         ranking = scores(found, unimitated(fit))
-        return ranking, self._begun(replace(self.nominal, fit=fit), ranking) if ranking else []
+        if not ranking:
+            return [], []
+        chosen = shortlist(ranking, self.enough, suspected(fit, self.replays.measured))
+        return ranking, self._begun(replace(self.nominal, fit=fit), chosen)
 
     def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""

@@ -11,6 +11,9 @@ from pup.physics.terms import Place
 
 FINALISTS = 8
 """Hypotheses refitted in each round, beside those of the best one's class."""
+FURTHER = 24
+"""As many are where all that was tried leaves many times the noise: so far off slopes say little,
+and a friction that all but held its joint was the ninth (docs/results/diagnosis.md)."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
 IN_CONTACT = frozenset(("ground", "foot", "sensor"))
@@ -41,7 +44,9 @@ def suspected(fit: Fit, measured: Measured) -> bool:
     return float(squares[ground].mean()) > GROUNDED * max(air, SPARE)
 
 
-def shortlist(ranking: Sequence[Score], enough: float, contact: bool = False) -> list[Score]:
+def shortlist(
+    ranking: Sequence[Score], enough: float, contact: bool = False, most: int = FINALISTS
+) -> list[Score]:
     """The best score of each effect and place, as long as it promises enough.
 
     Forms that no refit leads from one to the other are all looked at, and so are effects of the
@@ -53,13 +58,14 @@ def shortlist(ranking: Sequence[Score], enough: float, contact: bool = False) ->
       ranking: all scores, best first.
       enough: surprise that chance does not reach.
       contact: whether all effects of contact are looked at too.
+      most: hypotheses that are looked at, beside those of the best one's class.
     """
     least = max(enough, WORTH * ranking[0].surprise)
     best: dict[tuple[tuple[str, Place], tuple[float, ...]], Score] = {}
     for score in ranking:
         hypothesis = score.trace.hypothesis
         known = {key for key, _ in best}
-        room = hypothesis.key in known or len(known) < FINALISTS
+        room = hypothesis.key in known or len(known) < most
         if score.surprise >= least and room:
             best.setdefault((hypothesis.key, hypothesis.choices), score)
     shared = {effect for (effect, place), _ in best if place.kind == "group"}

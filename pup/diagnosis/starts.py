@@ -98,6 +98,11 @@ def puzzling(before: Fit, tried: Sequence[Tried]) -> bool:
     return left > min(PUZZLING * (before.chi2 - noise), GLARING * noise)
 
 
+def glaring(left: float, samples: int) -> bool:
+    """Whether what a fit leaves of chi-squared is many times the noise."""
+    return left - samples > GLARING * samples
+
+
 def distinct(tried: Sequence[Tried]) -> list[Tried]:
     """The best fit of each newest effect at each place, of each of its choices."""
     best: dict[object, Tried] = {}
