@@ -45,6 +45,8 @@ def found(missing: Mapping[str, float], seed: int = 3, effects: int = 8) -> Diag
         ({f"backlash/gap@{SERVO}": 0.008, f"backlash/behind@{SERVO}": 1.0}, "backlash", "gap"),
         ({f"torque_speed_limit/slope@{SERVO}": 0.03}, "torque_speed_limit", "slope"),
         ({f"cogging/sine@{SERVO}": 0.012, f"cogging/teeth@{SERVO}": 42.0}, "cogging", "sine"),
+        # Of friction that brakes one way only, that of the other way is no opposite.
+        ({f"friction_asymmetry/torque@{SERVO}": -0.05}, "friction_asymmetry", "torque"),
     ],
 )
 def test_a_concealed_effect_is_named_and_measured(

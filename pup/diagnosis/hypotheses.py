@@ -35,12 +35,14 @@ class Hypothesis:
       place: where it acts.
       scale: of the robot.
       shape: values of its shape quantities, by column.
+      sign: of the sizes that it is first tried in.
     """
 
     effect: str
     place: Place
     scale: Scale
     shape: tuple[tuple[str, float], ...] = ()
+    sign: float = 1.0
 
     @property
     def family(self) -> str:
@@ -59,8 +61,13 @@ class Hypothesis:
 
     @property
     def form(self) -> tuple[float, ...]:
-        """Values of its shape quantities."""
-        return tuple(value for _, value in self.shape)
+        """Its sign, and the values of its shape quantities."""
+        return self.sign, *(value for _, value in self.shape)
+
+    @property
+    def moderate(self) -> float:
+        """The size that it is first looked at in, in typical ones."""
+        return self.sign * MODERATE
 
     @cached_property
     def magnitudes(self) -> tuple[str, ...]:
@@ -97,14 +104,14 @@ class Hypothesis:
     def row(self, sizes: Mapping[str, float] | None = None) -> dict[str, float]:
         """The term's columns, at given magnitudes or at moderate ones."""
         given = sizes or {
-            n: MODERATE * t for n, t in zip(self.magnitudes, self.typical, strict=True)
+            n: self.moderate * t for n, t in zip(self.magnitudes, self.typical, strict=True)
         }
         return {**dict(self.shape), **given}
 
     def probes(self) -> list[dict[str, float]]:
         """One row for each magnitude alone, at a moderate size."""
         return [
-            self.row({name: MODERATE * typical})
+            self.row({name: self.moderate * typical})
             for name, typical in zip(self.magnitudes, self.typical, strict=True)
         ]
 
@@ -118,11 +125,12 @@ def hypotheses(measured: Measured) -> list[Hypothesis]:
     scale = Scale.of(measured.robot)
     known = {(term.effect, Place(term.kind, term.name)) for term in measured.robot.terms}
     return [
-        Hypothesis(effect, place, scale, shape)
-        for effect in TERMS
+        Hypothesis(effect, place, scale, shape, sign)
+        for effect, term in TERMS.items()
         for place in _places(effect, measured)
         if (effect, place) not in known
         for shape in _shapes(effect, place, measured, scale)
+        for sign in ((1.0, -1.0) if term.one_way else (1.0,))
     ]
 
 

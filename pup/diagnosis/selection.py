@@ -24,7 +24,7 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.retracing import Retracer
-from pup.diagnosis.shortlist import FURTHER, in_contact, shortlist, suspected
+from pup.diagnosis.shortlist import FAINT, FURTHER, in_contact, shortlist, suspected
 from pup.diagnosis.starts import (
     LIMB,
     Tried,
@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 
 FIRST, ROUGH = 2, 5
 """Steps of all finalists until they are compared, and of those promising then."""
-HOPE = 0.5
+HOPE = 0.65
 """Share of the best one's gain by which a finalist may be behind at first."""
 CLOSE, MARGIN = 4, 40.0
 """So many of other classes than the best one's are refitted to the end, if they are within so much
@@ -193,7 +193,7 @@ class Selector:
         if len(measured.robot.joints) > LIMB or not glaring(left, len(measured.values)):
             return []
         known = {effects[-1] for effects, _ in tried}
-        chosen = shortlist(ranking, self.enough, most=FURTHER)
+        chosen = shortlist(ranking, self.enough, most=FURTHER, worth=FAINT)
         more = self._begun(model, [s for s in chosen if s.trace.hypothesis not in known])
         self._refit(more, model.fit.chi2)
         return more

@@ -11,9 +11,10 @@ from pup.physics.terms import Place
 
 FINALISTS = 8
 """Hypotheses refitted in each round, beside those of the best one's class."""
-FURTHER = 24
-"""As many are where all that was tried leaves many times the noise: so far off slopes say little,
-and a friction that all but held its joint was the ninth (docs/results/diagnosis.md)."""
+FURTHER, FAINT = 24, 0.01
+"""As many are, and for so much less promise, where all that was tried leaves many times the noise:
+so far off slopes say little. A friction that all but held its joint was the ninth, one that acts
+one way only the thirteenth (docs/results/diagnosis.md)."""
 WORTH = 0.1
 """A finalist promises at least this share of what the best one does."""
 IN_CONTACT = frozenset(("ground", "foot", "sensor"))
@@ -45,7 +46,11 @@ def suspected(fit: Fit, measured: Measured) -> bool:
 
 
 def shortlist(
-    ranking: Sequence[Score], enough: float, contact: bool = False, most: int = FINALISTS
+    ranking: Sequence[Score],
+    enough: float,
+    contact: bool = False,
+    most: int = FINALISTS,
+    worth: float = WORTH,
 ) -> list[Score]:
     """The best score of each effect and place, as long as it promises enough.
 
@@ -59,8 +64,9 @@ def shortlist(
       enough: surprise that chance does not reach.
       contact: whether all effects of contact are looked at too.
       most: hypotheses that are looked at, beside those of the best one's class.
+      worth: what they promise at least, as a share of what the best one does.
     """
-    least = max(enough, WORTH * ranking[0].surprise)
+    least = max(enough, worth * ranking[0].surprise)
     best: dict[tuple[tuple[str, Place], tuple[float, ...]], Score] = {}
     for score in ranking:
         hypothesis = score.trace.hypothesis

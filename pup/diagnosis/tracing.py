@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.evidence import Projector, Trace, scores, traced
 from pup.diagnosis.fit import Fit
-from pup.diagnosis.hypotheses import MODERATE, Hypothesis
+from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
@@ -110,9 +110,12 @@ def _simulated(
     """Whitened changes of some recordings' samples per typical size, (n_samples, n_magnitudes)."""
     probes = [probe for h in hypotheses for probe in h.probes()]
     changed = changes([(base.row(), probes, probes)], replays, recordings)[0]
-    white = replays.measured.whiten(changed, noise) / MODERATE
+    white = replays.measured.whiten(changed, noise)
     ends = np.cumsum([0, *(len(h.magnitudes) for h in hypotheses)])
-    return {h: white[a:b].T for h, a, b in zip(hypotheses, ends[:-1], ends[1:], strict=True)}
+    return {
+        h: white[a:b].T / h.moderate
+        for h, a, b in zip(hypotheses, ends[:-1], ends[1:], strict=True)
+    }
 
 
 def _together(

@@ -185,6 +185,8 @@ class Term:
         real form may be another.
       starts: sizes, in typical ones, from which a fit may find others of its minima than from
         where slopes lead: what bounces has one at many a stiffness.
+      one_way: whether a negative size is no opposite of a positive one, as a brake of one direction
+        is none of the other's.
       needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
@@ -201,6 +203,7 @@ class Term:
     layout: ClassVar[Literal["joints", "carried", "bodies", "feet", "one"]] = "joints"
     constant: ClassVar[bool] = False
     starts: ClassVar[tuple[float, ...]] = ()
+    one_way: ClassVar[bool] = False
     needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 

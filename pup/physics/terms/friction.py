@@ -156,6 +156,8 @@ class FrictionAsymmetry(Friction):
         Quantity("torque", "N m", 0.04, 0.5, signed=True),
         Quantity("viscous", "N m s/rad", 0.05, 0.6, signed=True),
     )
+    starts = (-1.0, 1.0)
+    one_way = True
     source = "EMPS (Janot, Gautier, Brunot 2019): viscous friction 166.7 forward, 240.4 backward"
 
     def flow(self, flow: Flow) -> None:
