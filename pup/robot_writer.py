@@ -1,6 +1,7 @@
 """A robot's folder written anew: other nominal parameters, other terms, all else as it was."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ def write_corrected(
         document["actuator"] = actuator
     document.pop("term", None)
     if terms:
-        document.append("term", _tables([_of_term(term) for term in terms]))
+        document.append("term", tables([_of_term(term) for term in terms]))
     head = "".join(f"# {line}".rstrip() + "\n" for line in notes.splitlines())
     for file in (Path("model.xml"), *read_mjcf(robot.model_path).files):
         write_atomic(folder / file, (robot.folder / file).read_bytes())
@@ -83,15 +84,9 @@ def _set_parameter(document: Any, spec: ParameterSpec, value: float) -> None:
             if search != list(spec.search):
                 entry["search"] = search
             return
-    added = {
-        "name": spec.name,
-        "unit": spec.unit,
-        "nominal": value,
-        "search": search,
-        "actuators": list(spec.actuators),
-    }
+    added = entry_of(replace(spec, nominal=value, search=(search[0], search[1])))
     entries = document["parameter"]
-    entries.append(_table(added) if isinstance(entries, AoT) else added)
+    entries.append(table(added) if isinstance(entries, AoT) else added)
 
 
 def _set_weight(document: Any, robot: RobotDescription, name: str, value: float) -> None:
@@ -119,14 +114,27 @@ def _inline(values: Mapping[str, Any]) -> Any:
     return table
 
 
-def _table(values: Mapping[str, Any]) -> Any:
-    table = tomlkit.table()
-    table.update(values)
-    return table
+def table(values: Mapping[str, Any]) -> Any:
+    """A TOML table."""
+    made = tomlkit.table()
+    made.update(values)
+    return made
 
 
-def _tables(entries: Sequence[Mapping[str, Any]]) -> Any:
-    tables = tomlkit.aot()
+def tables(entries: Sequence[Mapping[str, Any]]) -> Any:
+    """A TOML array of tables."""
+    several = tomlkit.aot()
     for entry in entries:
-        tables.append(_table(entry))
-    return tables
+        several.append(table(entry))
+    return several
+
+
+def entry_of(spec: ParameterSpec) -> dict[str, Any]:
+    """A parameter as its `[[parameter]]` has it."""
+    return {
+        "name": spec.name,
+        "unit": spec.unit,
+        "nominal": spec.nominal,
+        "search": list(spec.search),
+        "actuators": list(spec.actuators),
+    }

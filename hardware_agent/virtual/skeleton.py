@@ -115,10 +115,9 @@ def standing(robot: RobotDescription, model: mujoco.MjModel, pose: Array) -> Arr
 
 def _sole(model: mujoco.MjModel, data: mujoco.MjData, foot: str) -> Array:
     """The upward axis of a foot's sole: of its site where there is one, or else of the body."""
-    for site in range(model.nsite):
-        on = model.body(model.site_bodyid[site]).name
-        if on == foot and model.site(site).name == sole_of(foot):
-            return np.asarray(data.site_xmat[site].reshape(3, 3)[:, 2])
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, sole_of(foot))
+    if site >= 0 and model.site_bodyid[site] == model.body(foot).id:
+        return np.asarray(data.site_xmat[site].reshape(3, 3)[:, 2])
     return np.asarray(data.body(foot).xmat.reshape(3, 3)[:, 2])
 
 

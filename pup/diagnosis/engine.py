@@ -269,7 +269,7 @@ def _judged(task: _Task, nominal: Nominal, done: Search, seen: Sequence[Regime])
         left, model = None, selector.nominal
         final = model
         shown = held_out(measured, model, model, task.seed)
-    odd = unrepeated(measured, task.replays.errors(final.fit.row()), nominal.noise, list(seen))
+    odd = unrepeated(measured, task.replays.errors(final.fit.row()), nominal.noise, seen)
     told = replace(
         task.told(nominal, seen, "none", reason),
         found=done.found,

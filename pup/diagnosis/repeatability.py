@@ -5,6 +5,8 @@ gear that sticks now and then, or a screw that is loose, would so pass for a noi
 reading to the next they are told apart: there an encoder is as noisy as ever.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,7 @@ that remembers 0.85 of itself from tick to tick, the most that counts as such, m
 
 
 def unrepeated(
-    measured: Measured, errors: Array, noise: Noise, found: list[Regime]
+    measured: Measured, errors: Array, noise: Noise, found: Sequence[Regime]
 ) -> Finding | None:
     """The joint whose repeats differ most, where that is more than its readings' noise.
 

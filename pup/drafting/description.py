@@ -8,6 +8,7 @@ from typing import Any
 import tomlkit
 
 from pup.robot_parts import Joint, ParameterSpec
+from pup.robot_writer import entry_of, table, tables
 
 SIDES = {
     "l": "r",
@@ -128,10 +129,10 @@ def written(draft: Draft, source: str) -> str:
             document.add(key, tomlkit.item(getattr(draft, key)))
     if draft.feet:
         document.add("feet", tomlkit.item(list(draft.feet)))
-    document.add("joint", _tables([_of_joint(joint) for joint in draft.joints]))
+    document.add("joint", tables([_of_joint(joint) for joint in draft.joints]))
     if draft.poses:
         document.add("poses", _poses(draft))
-    document.add("parameter", _tables([_of_parameter(spec) for spec in draft.parameters]))
+    document.add("parameter", tables([entry_of(spec) for spec in draft.parameters]))
     return tomlkit.dumps(document)
 
 
@@ -157,30 +158,9 @@ def _of_joint(joint: Joint) -> dict[str, Any]:
     return told
 
 
-def _of_parameter(spec: ParameterSpec) -> dict[str, Any]:
-    return {
-        "name": spec.name,
-        "unit": spec.unit,
-        "nominal": spec.nominal,
-        "search": list(spec.search),
-        "actuators": list(spec.actuators),
-    }
-
-
 def _poses(draft: Draft) -> Any:
     names = [joint.name for joint in draft.joints]
     poses = tomlkit.table(is_super_table=True)
     for pose, angles in draft.poses.items():
-        table = tomlkit.table()
-        table.update(dict(zip(names, angles, strict=True)))
-        poses.add(pose, table)
+        poses.add(pose, table(dict(zip(names, angles, strict=True))))
     return poses
-
-
-def _tables(entries: Sequence[dict[str, Any]]) -> Any:
-    tables = tomlkit.aot()
-    for entry in entries:
-        table = tomlkit.table()
-        table.update(entry)
-        tables.append(table)
-    return tables
