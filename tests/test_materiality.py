@@ -44,6 +44,8 @@ def shown(gain: float) -> HeldOut:
         (0.25, 0.55, 0.20, False),  # a little of everything
         (0.12, 0.05, 0.30, True),  # small in its error, of a usual size
         (0.03, 0.05, 3.00, False),  # of any size, but it hardly shows
+        (0.03, 0.15, 3.00, True),  # hidden by a fit to all, and motions left out show it
+        (0.03, 0.15, 0.20, False),  # the same of something small
         (0.12, 0.01, 3.00, False),  # predicts nothing
     ],
 )
@@ -74,4 +76,17 @@ def test_better_are_joints_or_else_the_torso(
     joints: tuple[float, float], torso: tuple[float, float], told: bool
 ) -> None:
     held = HeldOut(("a",), *joints, (0.0, 0.0), per_tilt={"roll": (0.1, 0.1), "pitch": torso})
+    assert held.better is told
+
+
+@pytest.mark.parametrize(
+    ("after", "told"),
+    [
+        ((1.0, 1.0, 1.0, 9.0), True),  # what only drops show is guessed where they are left out
+        ((1.0, 1.0, 3.0, 9.0), False),
+    ],
+)
+def test_better_are_most_types_of_motion(after: tuple[float, ...], told: bool) -> None:
+    motions = dict(zip("abcd", ((2.0, value) for value in after), strict=True))
+    held = HeldOut(("a",), 1.0, 2.0, (0.0, 0.0), per_motion=motions)
     assert held.better is told

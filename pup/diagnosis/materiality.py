@@ -21,8 +21,9 @@ GAIN, FORESEEN = 0.3, 0.6
 """Shares of a joint's or a tilt's noise by which its error falls, on what was fitted and on motions
 left out, where that matters whatever the size is. A nominal fit that makes up for something small
 on all motions may be led far astray by some of them, so that more is asked of the others."""
-SHOWN, TRACE = 0.05, 0.02
-"""The same below which an effect of any size does not show."""
+SHOWN, FORETOLD, TRACE = 0.05, 0.1, 0.02
+"""The same that an effect of any size shows: on what was fitted, or else on motions left out, of
+which a nominal fit to all may hide much; and what those have to gain at least."""
 
 
 def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
@@ -37,8 +38,9 @@ def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
     explained = _explained(nominal, model)
     if improves(model, shown, noise) or explained > GAIN:
         return True
-    predicts = shown.better and max(_gains(model, shown, noise)) > TRACE
-    return predicts and explained > SHOWN and _largest(model) >= SLIGHT
+    foretold = max(_gains(model, shown, noise)) if shown.better else 0.0
+    shows = explained > SHOWN or foretold > FORETOLD
+    return foretold > TRACE and shows and _largest(model) >= SLIGHT
 
 
 def improves(model: Model, shown: HeldOut, noise: Noise) -> bool:
