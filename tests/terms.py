@@ -24,6 +24,9 @@ OP2 = RobotDescription.load("darwin_op2")
 G = 9.81
 SERVO = {"kp/servo": 6.0, "kd/servo": 0.25, "tau_max/servo": 1.2, "armature": 0.003}
 """A servo for the bench that damps its load well."""
+AT = "@joint:servo"
+STEP = BENCH.timestep
+FREE = 1.3e-6 + SERVO["armature"]  # kg m², without the load
 LEVER = 0.3247 * 0.1  # kg m, of the bench's load
 INERTIA = LEVER * 0.1 + 1.1e-6 + SERVO["armature"]
 LIGHT = {"mass": 0.001, "length": 0.01}

@@ -1,6 +1,5 @@
 """The scorer, on made-up verdicts whose scores can be told by hand."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,15 +25,11 @@ from blind_scores import (
     verdict,
 )
 from blind_sets import poor
-from commandline import pup
 
 from pup.blind.judge import ranking
-from pup.blind.score import Replayed, score_set
+from pup.blind.score import Replayed
 from pup.blind.seal import commit
-from pup.blind.statistics import calibration, rate
 from pup.blind.table import markdown
-from pup.errors import InputError
-from pup.files import write_json
 from pup.recording import write_recordings
 
 
@@ -381,52 +376,3 @@ def test_the_key_says_what_a_refit_leaves_of_test_motions(tmp_path: Path) -> Non
     ratio = scored(folder, replay=replay)["all"]["oracle_ratio"]
     assert asked == ["case_a"]  # c has nothing to be gained, n is a null
     assert ratio == {"of": 3, "mean": pytest.approx(0.25), "median": 0.0}
-
-
-def test_intervals_are_those_of_clopper_and_pearson() -> None:
-    assert rate(0, 150)["ci95"] == [0.0, pytest.approx(1 - 0.025 ** (1 / 150))]
-    assert rate(77, 100)["ci95"] == pytest.approx([0.6751, 0.8483], abs=1e-4)
-    assert rate(0, 0) == {"hits": 0, "of": 0, "rate": None, "ci95": None}
-    assert calibration([], [])["ece"] is None
-
-
-def test_few_claims_are_off_by_chance_and_many_are_not() -> None:
-    few, many = [0.8] * 10, [0.8] * 1000
-    told = calibration(few, [True] * 6 + [False] * 4)
-    assert told["ece"] == pytest.approx(0.2)
-    assert told["ece_chance"] == pytest.approx(0.2)  # 6 of 10 or nearer: 97 % of binomial draws
-    assert calibration(many, [True] * 800 + [False] * 200)["ece_chance"] < 0.03
-    assert calibration([1.0], [True])["ece_chance"] == 0.0
-
-
-def test_the_command_writes_scores_and_a_table(revealed: Path) -> None:
-    options = ("--set", revealed / "set", "--key", revealed / "key.json")
-    where = ("--diagnoses", revealed / "diagnoses", "--out", revealed / "scores.json")
-    done = pup("blind", "score", *options, *where, "--json")
-    assert done.code == 0 and done.json()["cases"] == 10
-    table = (revealed / "scores.md").read_text()
-    assert "| detected | 0.67 (4/6) |" in table
-    assert "| false positives | 0.50 (1/2) |" in table
-    assert table.count("no diagnosis") == 1
-    assert "| class, first, nuisances that are there counted as true | 0.60 (3/5) |" in table
-    assert json.loads((revealed / "scores.json").read_text())["all"]["detected"]["hits"] == 4
-
-
-def test_verdicts_that_break_the_contract_are_refused(revealed: Path) -> None:
-    broken = revealed / "diagnoses" / "case_a" / "diagnosis.json"
-    write_json(broken, verdict("mismatch", {"effect": "cogging"}))
-    with pytest.raises(InputError, match="does not follow the contract"):
-        scored(revealed)
-    write_json(broken, {"schema": 2})
-    with pytest.raises(InputError, match="not a diagnosis"):
-        scored(revealed)
-
-
-def test_a_folder_without_verdicts_is_refused(revealed: Path, tmp_path: Path) -> None:
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    with pytest.raises(InputError, match="no case_<id>"):
-        score_set(revealed / "set", revealed / "key.json", empty)
-    write_json(empty / "case_other" / "diagnosis.json", verdict("none"))
-    with pytest.raises(InputError, match="of a case of this set"):
-        score_set(revealed / "set", revealed / "key.json", empty)
