@@ -76,7 +76,7 @@ CASES = [
                 *("dead_band", place("joint", "r_hip_pitch"), 0.6),
                 equivalents=[named("backlash", HIP, 0.3)],
             ),
-            next_recording={"motion": "hold"},
+            next_recording={"motion": "hold", "splits": [["backlash", "dead_band"]]},
         ),
     ),
     (case("c", "masked", effect("voltage_sag", BUS, unit="ohm")), verdict("none")),
@@ -125,3 +125,8 @@ def reveal(folder: Path, cases: Any) -> Path:
 
 def scored(folder: Path, **more: Any) -> dict[str, Any]:
     return score_set(folder / "set", folder / "key.json", folder / "diagnoses", **more)
+
+
+def hits(scores: Any, name: str) -> tuple[int, int]:
+    """A rate of some scores, as it is counted."""
+    return scores[name]["hits"], scores[name]["of"]

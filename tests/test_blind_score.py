@@ -18,6 +18,7 @@ from blind_scores import (
     case,
     effect,
     finding,
+    hits,
     named,
     place,
     reveal,
@@ -26,10 +27,9 @@ from blind_scores import (
 )
 from blind_sets import poor
 
-from pup.blind.judge import ranking
+from pup.blind.claims import ranking
 from pup.blind.score import Replayed
 from pup.blind.seal import commit
-from pup.blind.table import markdown
 from pup.recording import write_recordings
 
 
@@ -61,24 +61,6 @@ def test_rates_are_those_counted_by_hand(revealed: Path) -> None:
     assert (scores["cases"], scores["missing"]) == (10, 1)
 
 
-def test_nulls_with_material_nuisance_are_no_false_positives(revealed: Path) -> None:
-    nulls = scored(revealed)["nulls"]
-    assert (nulls["false_positives"]["hits"], nulls["false_positives"]["of"]) == (1, 2)
-    assert (nulls["material_nuisance"]["hits"], nulls["material_nuisance"]["of"]) == (1, 1)
-
-
-def hits(scores: Any, name: str) -> tuple[int, int]:
-    return scores[name]["hits"], scores[name]["of"]
-
-
-def test_nulls_without_a_diagnosis_are_counted_apart(tmp_path: Path) -> None:
-    cases = [(case(n, "null:noise"), verdict("none") if n == "a" else None) for n in "abc"]
-    nulls = scored(reveal(tmp_path, cases))["nulls"]
-    assert hits(nulls, "false_positives") == (0, 1)
-    assert hits(nulls, "told_none") == (1, 1)
-    assert hits(nulls, "missing") == (2, 3)
-
-
 @pytest.mark.parametrize("kind", ["none", "undetermined"])
 def test_findings_count_where_the_verdict_is_a_mismatch(tmp_path: Path, kind: str) -> None:
     right = finding("coulomb_friction", KNEE, 0.9, parameters=TORQUE, when=[SPAN], law="x")
@@ -91,39 +73,66 @@ def test_findings_count_where_the_verdict_is_a_mismatch(tmp_path: Path, kind: st
         assert scores["all"][name]["of"] == 0
 
 
-def test_what_is_immaterial_has_a_line_of_its_own(tmp_path: Path) -> None:
-    """By the yardstick of nulls: nothing material is missing, and a matched filter sees it."""
-    slight = {"material": False, "held_out_gain_sigma": 0.1, "snr": 12.0, "when": []}
-    calm = slight | {"snr": 3.0}
-    alarm = verdict("mismatch", finding("cogging", HIP, 0.9))
+def test_a_set_holds_what_is_at_its_place(tmp_path: Path) -> None:
+    """And an effect at two places is two of it."""
+    friction = effect("coulomb_friction", KNEE)
+
+    def told(name: str, *where: Any) -> Any:
+        first, *others = (named("coulomb_friction", place, 0.3) for place in where)
+        head = finding(*first.values(), equivalents=others)
+        return case(name, "single", friction), verdict("mismatch", head)
+
+    everything = scored(reveal(tmp_path, [told("a", HIP), told("b", HIP, KNEE)]))["all"]
+    assert hits(everything, "set_covers") == (1, 2)
+    assert everything["set_size"]["mean"] == 1.5
+
+
+@pytest.mark.parametrize(
+    ("first", "splits", "told"),
+    [
+        ("command_delay", [["command_delay", "measurement_delay"]], True),
+        ("command_delay", [["coulomb_friction", "cogging"]], False),  # of another finding
+        ("command_delay", [], False),
+        ("payload", [["payload", "measurement_delay"]], False),  # the truth is not among them
+    ],
+)
+def test_a_next_recording_splits_a_set_that_holds_the_truth(
+    tmp_path: Path, first: str, splits: Any, told: bool
+) -> None:
+    head = finding(first, BUS, 0.5, equivalents=[named("measurement_delay", BUS, 0.4)])
+    asked = {"motion": "hold", "splits": splits}
+    truth = case("a", "masked", effect("command_delay", BUS, 0.01, "s"))
+    cases = [(truth, verdict("mismatch", head, next_recording=asked))]
+    everything = scored(reveal(tmp_path, cases))["all"]
+    assert hits(everything, "ambiguous_with_next_recording") == (int(told), 1)
+    assert hits(everything, "found_or_split") == (int(first == "command_delay"), 1)
+
+
+def test_a_masked_one_may_be_in_a_set_that_is_split(tmp_path: Path) -> None:
+    head = finding("com_offset", KNEE, 0.5, equivalents=[named("voltage_sag", BUS, 0.4)])
+    asked = {"motion": "hold", "splits": [["com_offset", "voltage_sag"]]}
+    truth = case("a", "masked", effect("voltage_sag", BUS, unit="ohm"))
+    scores = scored(reveal(tmp_path, [(truth, verdict("mismatch", head, next_recording=asked))]))
+    assert hits(scores["all"], "class_top1") == (0, 1)
+    assert hits(scores["all"], "found_or_split") == (1, 1)
+
+
+def test_what_cannot_be_decided_is_not_told_by_other_names(tmp_path: Path) -> None:
+    delays = {"verdicts": ["mismatch"], "set": ["command_delay", "measurement_delay"]}
+    mass = {"verdicts": ["none", "undetermined"], "set": []}
+    rivals = finding("cogging", KNEE, 0.5, equivalents=[named("backlash", KNEE, 0.4)])
+    sure = finding("payload", KNEE, 0.95)
+    late = effect("command_delay", BUS, 0.01, "s")
     cases = [
-        (case("a", "below_noise", effect("cogging", HIP), effect_seen=slight), alarm),
-        (case("b", "single", effect("cogging", HIP), effect_seen=slight), verdict("none")),
-        (case("c", "single", effect("cogging", HIP)), verdict("none")),
-        (case("n", "null:nuisance", nuisance=[effect("cogging", HIP)], all_seen=slight), alarm),
-        (case("m", "null:nuisance", nuisance=[effect("cogging", HIP)], all_seen=calm), alarm),
+        (case("a", "unidentifiable", late, answer=delays), verdict("mismatch", rivals)),
+        (
+            case("b", "unidentifiable", effect("payload", KNEE), answer=mass),
+            verdict("mismatch", sure),
+        ),
     ]
-    scores = scored(reveal(tmp_path, cases))
-    assert hits(scores["all"], "detected") == (0, 1)
-    assert hits(scores["lines"]["immaterial"], "detected") == (1, 2)
-    assert hits(scores["per_stratum"]["single"], "detected") == (0, 2)
-    assert hits(scores["nulls"], "false_positives") == (1, 1)
-    assert hits(scores["nulls"], "visible_nuisance") == (1, 1)
-    assert [f["case"] for f in scores["failures"]] == ["c", "m"]
-    page = markdown(scores)
-    assert "| immaterial, of any stratum | 0.50 (1/2) |" in page
-    assert "clear to a matched filter found (not counted above) | 1.00 (1/1) |" in page
-
-
-def test_masked_cases_that_are_mostly_absorbed_have_a_line_besides(tmp_path: Path) -> None:
-    def masked(name: str, share: float) -> Any:
-        seen = {"material": True, "absorbed": share}
-        return case(name, "masked", effect("voltage_sag", BUS), effect_seen=seen), verdict("none")
-
-    scores = scored(reveal(tmp_path, [masked("a", 0.6), masked("b", 0.9)]))
-    assert hits(scores["per_stratum"]["masked"], "detected") == (0, 2)
-    assert hits(scores["lines"]["masked_85"], "detected") == (0, 1)
-    assert "| masked, 85 % absorbed | 0.00 (0/1) |" in markdown(scores)
+    everything = scored(reveal(tmp_path, cases))["all"]
+    assert hits(everything, "unidentifiable_allowed") == (0, 2)
+    assert hits(everything, "set_covers") == (0, 2)
 
 
 def test_a_name_is_sharp_by_its_share_of_the_finding(tmp_path: Path) -> None:
@@ -142,24 +151,30 @@ def test_a_name_is_sharp_by_its_share_of_the_finding(tmp_path: Path) -> None:
 
 
 def test_unknown_counts_first_or_where_it_is_stated(tmp_path: Path) -> None:
-    def told(name: str, probability: float) -> Any:
-        first, later = finding("cogging", KNEE, 0.9), finding("unknown", KNEE, probability)
+    def told(name: str, probability: float, where: Any = KNEE) -> Any:
+        first, later = finding("cogging", KNEE, 0.9), finding("unknown", where, probability)
         truth = case(name, "unlisted", effect("unknown", KNEE))
         return truth, verdict("mismatch", first, later)
 
-    scores = scored(reveal(tmp_path, [told("a", 0.4), told("b", 0.6)]))
-    assert hits(scores["all"], "unlisted_flagged") == (1, 2)
+    cases = [told("a", 0.4), told("b", 0.6), told("c", 0.6, place("joint", "head_pan"))]
+    scores = scored(reveal(tmp_path, cases))
+    assert hits(scores["all"], "unlisted_flagged") == (1, 3)
 
 
 def test_each_of_a_pair_needs_a_finding_of_its_own(tmp_path: Path) -> None:
     both = (effect("coulomb_friction", KNEE), effect("cogging", KNEE))
     within = finding("coulomb_friction", KNEE, 0.5, equivalents=[named("cogging", KNEE, 0.4)])
     apart = [finding("coulomb_friction", KNEE, 0.5), finding("cogging", KNEE, 0.4)]
+    hardly = finding("payload", KNEE, 0.3, equivalents=[named("cogging", KNEE, 0.01)])
     cases = [
         (case("a", "pair", *both), verdict("mismatch", within)),
         (case("b", "pair", *both), verdict("mismatch", *apart)),
+        (case("c", "pair", *both), verdict("mismatch", within, hardly)),
+        (case("d", "pair", *both), verdict("mismatch", finding("payload", KNEE, 0.9))),
     ]
-    assert hits(scored(reveal(tmp_path, cases))["all"], "pairs_both_in_top3") == (1, 2)
+    everything = scored(reveal(tmp_path, cases))["all"]
+    assert hits(everything, "pairs_both_in_top3") == (1, 4)
+    assert hits(everything, "pairs_one_in_top3") == (3, 4)
 
 
 def test_sizes_are_compared_where_the_places_meet(tmp_path: Path) -> None:

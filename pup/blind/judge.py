@@ -9,32 +9,14 @@ import numpy as np
 
 from pup.blind.absorb import FAINT
 from pup.blind.catalogue import CLASS_OF
+from pup.blind.claims import UNKNOWN, Named, class_of, confidence, rank, ranking, sharp
 from pup.blind.places import covered, credit
 from pup.robot import RobotDescription
 
-SHARP = 0.8  # share of a finding's probability from which a name counts as a sharp claim
 STATED = 0.5  # probability from which `unknown` counts though something else stands first
 PER_SECOND = 100  # resolution in which spans of time are compared
 CALM = "null:nuisance"  # the nulls that have a nuisance
-UNKNOWN = "unknown"  # what a finding outside the list is called
 OWN_LINES = ("weak", "unidentifiable")  # strata in which little to be gained is the rule
-
-
-@dataclass(frozen=True)
-class Named:
-    """One explanation in a diagnosis: a finding or one of its equivalents.
-
-    Attributes:
-      effect: its name.
-      place: as in the document.
-      probability: of it.
-      finding: index of the finding it belongs to.
-    """
-
-    effect: str
-    place: Mapping[str, Any]
-    probability: float
-    finding: int
 
 
 @dataclass(frozen=True)
@@ -49,6 +31,8 @@ class Judged:
       excused: whether it is a null whose nuisance is material.
       visible: whether it is a null whose nuisance is not, yet clear enough to be detected.
       immaterial: whether what is missing gains too little on held-out motions to be material.
+      ground: whether the robot stands on the ground in any of its recordings.
+      snr: of what is missing, to a matched filter, after a refit.
       absorbed: share of what is missing that a refit hides.
       nuisance: what a complete model of a null's nuisance gains, in units of sigma.
       verdict: the diagnosis's, or `missing`.
@@ -59,17 +43,18 @@ class Judged:
       place: credit for the place that is named first, 0 to 1; None on a robot of one joint.
       background: whether what stands first is a nuisance that is there, by class and place.
       place_background: as `place`, such a nuisance's place counted as right.
-      covered: whether the first finding and its equivalents hold the truth.
-      size: how many effects those are.
+      covered: whether the first finding and its equivalents hold the truth, at its place.
+      size: how many those are, an effect at two places counted twice.
       sharp: whether the first finding is all but a single effect.
       allowed: whether the verdict is one that the data allow.
-      unknown: whether something outside the list is told of.
+      unknown: whether something outside the list is told of; where that is the truth, at its place.
       confidence: probability of the class named first.
       regime: F1 of the times at which it is said to act.
       errors: relative errors of comparable parameters.
       inside: whether their 90 % intervals hold the truth.
-      ambiguous: whether more than one effect, or no verdict, is left standing.
-      next: whether a next recording is proposed.
+      ambiguous: whether the first finding leaves more than one effect standing.
+      next: whether a next recording is proposed: one that splits these effects, the truth among
+        them, or where the verdict is `undetermined`, any.
       seconds: how long the diagnosis took.
       oracle: share of the possible gain on the test motions that was had.
       named: the first three effects, for the list of failures.
@@ -83,6 +68,8 @@ class Judged:
     verdict: str
     visible: bool = False
     immaterial: bool = False
+    ground: bool = False
+    snr: float | None = None
     absorbed: float | None = None
     nuisance: float | None = None
     exact: int | None = None
@@ -107,34 +94,6 @@ class Judged:
     named: tuple[str, ...] = field(default=())
 
 
-def ranking(findings: Sequence[Mapping[str, Any]]) -> list[Named]:
-    """Findings and their equivalents: what is claimed first, then all others by probability.
-
-    First is the first finding, for findings stand most important first (contract, section 5); a
-    finding `unknown` is where it is more probable than that one. Among equals the others stay as
-    they stand in the document, each finding before its equivalents.
-    """
-    groups = [
-        [
-            Named(
-                str(e["effect"]),
-                e["place"],
-                float(e["probability"]),
-                index,
-            )
-            for e in (finding, *finding.get("equivalents", []))
-        ]
-        for index, finding in enumerate(findings)
-    ]
-    if not groups:
-        return []
-    heads = [group[0] for group in groups]
-    rivals = [head for head in heads if head.effect == UNKNOWN]
-    first = max([heads[0], *rivals], key=lambda n: n.probability)
-    others = [n for group in groups for n in group if n is not first]
-    return [first, *sorted(others, key=lambda n: -n.probability)]
-
-
 def judge(
     truth: Mapping[str, Any],
     diagnosis: Mapping[str, Any] | None,
@@ -155,7 +114,8 @@ def judge(
     verdict = str(document["verdict"])
     findings = document.get("findings", []) if verdict == "mismatch" else []
     named = ranking(findings)
-    group = _group(findings)
+    group = [n for n in named if n.finding == 0]
+    effects = truth.get("effects", [])
     background = _background(robot, named, truth.get("nuisance", []))
     stood = _stood(truth)
     case: dict[str, Any] = {
@@ -164,34 +124,32 @@ def judge(
         "stratum": truth["stratum"],
         **stood,
         "verdict": verdict,
-        "size": len(group) or None,
-        "sharp": _sharp(document.get("findings", [])),
+        "size": len({(n.effect, covered(robot, n.place)) for n in group}) or None,
+        "sharp": sharp(document.get("findings", [])),
         "allowed": verdict in truth["answer"]["verdicts"] or stood["immaterial"],
-        "unknown": any(
-            n.effect == UNKNOWN and (n is named[0] or n.probability >= STATED) for n in named
-        ),
-        "confidence": _confidence(named),
+        "unknown": _told_unknown(robot, named, effects),
+        "confidence": confidence(named),
         "background": bool(background),
-        "ambiguous": verdict == "undetermined" or len(group) > 1,
-        "next": document.get("next_recording") is not None,
+        "ambiguous": len({n.effect for n in group}) > 1,
+        "next": verdict == "undetermined" and document.get("next_recording") is not None,
         "seconds": _seconds(document),
         "oracle": oracle,
         "named": tuple(dict.fromkeys(n.effect for n in named))[:3],
     }
     if stood["null"]:
         return Judged(**case)
-    effects = truth["effects"]
     wanted = {str(e["effect"]) for e in effects}
     accepted = wanted | {b for e in effects for b in e["besides"]}
     classes = {CLASS_OF[e] for e in accepted if e in CLASS_OF}
-    answers = set(truth["answer"]["set"])
+    holds = _holds(robot, group, truth)
     case |= {
-        "exact": _rank([n.effect for n in named], wanted),
-        "kind": _rank([_class(n.effect) for n in named], classes or wanted),
+        "exact": rank([n.effect for n in named], wanted),
+        "kind": rank([class_of(n.effect) for n in named], classes or wanted),
         "all_found": _all_found(named, effects),
         "place": _placed(robot, named, effects),
         "place_background": _placed(robot, named, [*effects, *background]),
-        "covered": answers <= group if answers and group else bool(group & accepted),
+        "covered": holds,
+        "next": case["next"] or (holds and _splits(document.get("next_recording"), group)),
         "regime": _regime(truth, findings, repeats),
     }
     errors, inside = _parameters(robot, effects, findings)
@@ -211,44 +169,78 @@ def _stood(truth: Mapping[str, Any]) -> dict[str, Any]:
         "excused": excused,
         "visible": nuisance.get("snr", 0.0) >= FAINT and not excused,
         "immaterial": not null and stratum not in OWN_LINES and alone.get("material") is False,
+        "ground": bool(truth.get("ground")),
+        "snr": None if null else alone.get("snr"),
         "absorbed": None if null else alone.get("absorbed"),
         "nuisance": nuisance.get("held_out_gain_sigma"),
     }
 
 
-def _group(findings: Sequence[Mapping[str, Any]]) -> set[str]:
-    """The effects that the first finding leaves standing."""
-    if not findings:
-        return set()
-    return {str(e["effect"]) for e in (findings[0], *findings[0].get("equivalents", []))}
+def _holds(robot: RobotDescription, group: Sequence[Named], truth: Mapping[str, Any]) -> bool:
+    """Whether what the first finding leaves standing holds the truth.
+
+    Where data cannot decide it is all of the answers, and nothing where a name is wrong as such.
+    """
+    answers = set(truth["answer"]["set"])
+    if answers:
+        return answers <= {n.effect for n in group}
+    if "mismatch" not in truth["answer"]["verdicts"]:
+        return False
+    return any(
+        n.effect in (effect["effect"], *effect["besides"])
+        and _meet(robot, n.place, effect["place"])
+        for n in group
+        for effect in truth["effects"]
+    )
 
 
-def _sharp(findings: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether one effect has nearly all of the first finding's probability."""
-    mass: dict[str, float] = {}
-    for finding in findings[:1]:
-        for one in (finding, *finding.get("equivalents", [])):
-            mass[one["effect"]] = mass.get(one["effect"], 0.0) + float(one["probability"])
-    return bool(mass) and max(mass.values()) >= SHARP * sum(mass.values())
+def _splits(recording: Mapping[str, Any] | None, group: Sequence[Named]) -> bool:
+    """Whether a next recording would tell effects apart that the first finding leaves standing."""
+    standing = {n.effect for n in group}
+    pairs = (recording or {}).get("splits", [])
+    return any(len(set(pair) & standing) > 1 for pair in pairs)
+
+
+def _told_unknown(
+    robot: RobotDescription, named: Sequence[Named], effects: Sequence[Mapping[str, Any]]
+) -> bool:
+    """Whether something outside the list is told of: first, or as more likely than not.
+
+    Where that is the truth, at its place: what is told elsewhere is something else.
+    """
+    places = [e["place"] for e in effects if e["effect"] == UNKNOWN]
+    return any(
+        n.effect == UNKNOWN
+        and (n is named[0] or n.probability >= STATED)
+        and (not places or any(_meet(robot, n.place, place) for place in places))
+        for n in named
+    )
+
+
+def _meet(robot: RobotDescription, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two places have something in common."""
+    return bool(covered(robot, one) & covered(robot, other))
 
 
 def _all_found(named: Sequence[Named], effects: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether each effect has a finding of its own, by classes that stand among the first three."""
-    first = list(dict.fromkeys(_class(n.effect) for n in named))[:3]
+    """Whether each effect has a finding of its own, by classes that stand among the first three.
+
+    A finding tells of what it is named after, and of a class that is most probable in it.
+    """
+    foremost: dict[str, Named] = {}
+    for n in named:
+        foremost.setdefault(class_of(n.effect), n)
+    first = set(list(foremost)[:3])
+    heads = [n for n in named if n.head]
     tellers = [
-        {n.finding for n in named if _class(n.effect) in _classes_of(effect).intersection(first)}
+        {
+            n.finding
+            for n in (*foremost.values(), *heads)
+            if class_of(n.effect) in _classes_of(effect) & first
+        }
         for effect in effects
     ]
     return any(len(set(choice)) == len(effects) for choice in product(*tellers))
-
-
-def _confidence(named: Sequence[Named]) -> float | None:
-    """Probability of the class that is named first, its members in the same finding added up."""
-    if not named:
-        return None
-    first = named[0]
-    members = [n for n in named if n.finding == first.finding]
-    return min(1.0, sum(n.probability for n in members if _class(n.effect) == _class(first.effect)))
 
 
 def _background(
@@ -258,27 +250,15 @@ def _background(
     if not named:
         return []
     first = named[0]
-    told = covered(robot, first.place)
     return [
         n
         for n in nuisance
-        if _class(n["effect"]) == _class(first.effect) and told & covered(robot, n["place"])
+        if class_of(n["effect"]) == class_of(first.effect) and _meet(robot, first.place, n["place"])
     ]
 
 
-def _rank(named: Sequence[str], right: set[str]) -> int | None:
-    """Place of the first right name among different ones, from 1."""
-    different = list(dict.fromkeys(named))
-    return next((n for n, name in enumerate(different, start=1) if name in right), None)
-
-
 def _classes_of(effect: Mapping[str, Any]) -> set[str]:
-    return {_class(e) for e in (effect["effect"], *effect.get("besides", ()))}
-
-
-def _class(effect: str) -> str:
-    """The class of an effect; what is not on the list is one of its own."""
-    return CLASS_OF.get(effect, effect)
+    return {class_of(e) for e in (effect["effect"], *effect.get("besides", ()))}
 
 
 def _placed(
@@ -290,7 +270,7 @@ def _placed(
     """
     if len(robot.joints) == 1:
         return None
-    right = [(n, e) for n in named[:1] for e in effects if _class(n.effect) in _classes_of(e)]
+    right = [(n, e) for n in named[:1] for e in effects if class_of(n.effect) in _classes_of(e)]
     return max((credit(robot, n.place, e["place"]) for n, e in right), default=0.0)
 
 
@@ -328,11 +308,11 @@ def _parameters(
     """
     errors, inside = [], []
     for effect in effects:
-        size, there = effect["size"], covered(robot, effect["place"])
+        size = effect["size"]
         for finding in findings:
             if not effect["comparable"] or finding["effect"] != effect["effect"]:
                 continue
-            if not covered(robot, finding["place"]) & there:
+            if not _meet(robot, finding["place"], effect["place"]):
                 continue
             same = [p for p in finding.get("parameters", {}).values() if p["unit"] == size["unit"]]
             if len(same) == 1:

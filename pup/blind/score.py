@@ -19,7 +19,9 @@ from pup.robot import RobotDescription
 
 DIAGNOSIS, CORRECTED = "diagnosis.json", "corrected"
 TOP = 3
-HEAVY = 0.85  # share of the rms that a refit hides, from which a masked case has a line besides
+HEAVY = 0.85  # share of the rms that a refit hides, from which a case has a line besides
+LOUD = 8.0  # SNR after a refit, from which cases have a line besides
+SINGLE = ("single", "below_noise", "masked")  # strata of one effect that is to be named
 THERE = " (a nuisance that is there)"
 
 
@@ -64,7 +66,8 @@ def score_set(
 
     Returns:
       The scores, as JSON values. `all` and the robots' scores leave out the stratum `weak` and what
-      is immaterial; the former is among `per_stratum`, the latter among `lines`. `refits` tells
+      is immaterial; the former is among `per_stratum`, the latter among `lines`, as are all cases
+      of an SNR over 8, whatever is asked of them. `refits` tells
       where a diagnosis's nominal model comes nearer to the truth than the key's refit and counts.
 
     Raises:
@@ -85,7 +88,7 @@ def score_set(
         report(len(judged), len(truths))
     real = [case for case in judged if not case.null]
     counted = [case for case in real if case.stratum != "weak" and not case.immaterial]
-    masked = [case for case in real if case.stratum == "masked"]
+    hidden = [c for c in counted if c.stratum in SINGLE and (c.absorbed or 0.0) >= HEAVY]
     return {
         "schema": 1,
         "commitment": read_json(folder / COMMITMENT),
@@ -100,7 +103,10 @@ def score_set(
         },
         "lines": {
             "immaterial": _omissions([case for case in real if case.immaterial]),
-            "masked_85": _omissions([c for c in masked if (c.absorbed or 0.0) >= HEAVY]),
+            "masked_85": _omissions(hidden),
+            "snr_over_8": _omissions([c for c in real if (c.snr or 0.0) > LOUD]),
+            "suspended": _omissions([c for c in counted if not c.ground]),
+            "ground": _omissions([c for c in counted if c.ground]),
         },
         "per_robot": {
             name: _omissions([case for case in counted if case.robot == name])
@@ -163,7 +169,7 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
     listed = [c for c in cases if c.stratum not in ("unlisted", "unidentifiable")]
     open_ = [c for c in cases if c.stratum == "unidentifiable"]
     grouped = [*listed, *(c for c in open_ if c.size is not None)]
-    unclear = [c for c in cases if c.ambiguous]
+    pairs = [c for c in cases if c.stratum == "pair"]
     return {
         "detected": share([c.verdict == "mismatch" for c in cases if c not in open_]),
         "exact_top1": share([c.exact == 1 for c in listed]),
@@ -171,7 +177,9 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
         "class_top1": share([c.kind == 1 for c in listed]),
         "class_top1_or_nuisance": share([_true(c) for c in listed]),
         "class_top3": share([_within(c.kind) for c in listed]),
-        "pairs_both_in_top3": share([bool(c.all_found) for c in cases if c.stratum == "pair"]),
+        "found_or_split": share([c.kind == 1 or (c.ambiguous and c.next) for c in listed]),
+        "pairs_both_in_top3": share([bool(c.all_found) for c in pairs]),
+        "pairs_one_in_top3": share([_within(c.kind) for c in pairs]),
         "place_top1": mean([c.place for c in listed if c.place is not None]),
         "place_top1_or_nuisance": mean(
             [c.place_background for c in listed if c.place_background is not None]
@@ -181,10 +189,13 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
         "regime_f1": mean([c.regime for c in cases if c.regime is not None]),
         "parameter_error": mean([e for c in cases for e in c.errors]),
         "parameter_in_ci90": share([i for c in cases for i in c.inside]),
-        "unidentifiable_allowed": share([c.allowed and not c.sharp for c in open_]),
+        "unidentifiable_allowed": share([_left_open(c) for c in open_]),
         "unlisted_flagged": share([c.unknown for c in cases if c.stratum == "unlisted"]),
         "listed_flagged_unknown": share([c.unknown for c in listed]),
-        "ambiguous_with_next_recording": share([c.next for c in unclear]),
+        "ambiguous_with_next_recording": share([c.next for c in cases if c.ambiguous]),
+        "undetermined_with_next_recording": share(
+            [c.next for c in cases if c.verdict == "undetermined"]
+        ),
         "oracle_ratio": mean([c.oracle for c in cases if c.oracle is not None]),
         **_calibrations(cases),
         "seconds": mean([c.seconds for c in cases if c.seconds is not None]),
@@ -194,7 +205,7 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
 def _nulls(cases: Sequence[Judged]) -> dict[str, Any]:
     """The scores of cases in which nothing material is missing."""
     there = [c for c in cases if c.verdict != "missing"]
-    counted = [c for c in there if not c.excused and not c.visible]
+    counted = [c for c in there if not _nuisance_told(c)]
     return {
         "false_positives": share([c.verdict == "mismatch" for c in counted]),
         "told_none": share([c.verdict == "none" for c in counted]),
@@ -216,6 +227,16 @@ def _calibrations(cases: Sequence[Judged]) -> dict[str, Any]:
     }
 
 
+def _left_open(case: Judged) -> bool:
+    """Whether what data cannot decide is left open, between what it may be."""
+    return case.allowed and not case.sharp and (case.verdict != "mismatch" or bool(case.covered))
+
+
+def _nuisance_told(case: Judged) -> bool:
+    """Whether a null has a nuisance that may be told of: a material one, or by its right name."""
+    return case.excused or (case.visible and case.background)
+
+
 def _true(case: Judged) -> bool:
     """Whether the class named first is there, as an omission or as a nuisance."""
     return case.kind == 1 or case.background
@@ -230,11 +251,13 @@ def _faults(case: Judged) -> list[str]:
     if case.verdict == "missing":
         return ["no diagnosis"]
     if case.null:
-        called = case.verdict == "mismatch" and not case.excused and not case.visible
+        called = case.verdict == "mismatch" and not _nuisance_told(case)
         return [_alarm(case)] if called else []
     if case.stratum == "unidentifiable":
         faults = [] if case.allowed else [f"verdict {case.verdict}"]
-        return faults + ["sharp name where the data cannot tell"] * case.sharp
+        if case.sharp:
+            return [*faults, "sharp name where the data cannot tell"]
+        return faults or ["other names than what it may be"] * (not _left_open(case))
     if case.verdict != "mismatch":
         return [] if case.allowed else ["missed"]
     if case.stratum == "unlisted":

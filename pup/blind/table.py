@@ -11,7 +11,9 @@ ROWS = {
     "class_top1": "class, first",
     "class_top1_or_nuisance": f"class, first, {EITHER}",
     "class_top3": "class, first three",
+    "found_or_split": "class first, or in a set that the next recording splits",
     "pairs_both_in_top3": "pairs: both classes in the first three",
+    "pairs_one_in_top3": "pairs: one class at least in the first three",
     "place_top1": "place, first (mirror: half; robots of several joints)",
     "place_top1_or_nuisance": f"place, first, {EITHER}",
     "set_covers": "equivalence set holds the truth",
@@ -22,7 +24,8 @@ ROWS = {
     "unidentifiable_allowed": "unidentifiable: told so, no sharp name",
     "unlisted_flagged": "outside the list: told so",
     "listed_flagged_unknown": "on the list: told to be outside",
-    "ambiguous_with_next_recording": "ambiguous: next recording proposed",
+    "ambiguous_with_next_recording": "ambiguous, the truth among them: next recording splits them",
+    "undetermined_with_next_recording": "undetermined: next recording proposed",
     "oracle_ratio": "oracle ratio on test motions",
     "calibration": "calibration of the class, these cases",
     "calibration_or_nuisance": f"calibration of the class, these cases, {EITHER}",
@@ -32,7 +35,8 @@ NULL_ROWS = {
     "false_positives": "false positives",
     "told_none": "told `none`",
     "undetermined": "told `undetermined`",
-    "visible_nuisance": "immaterial nuisance clear to a matched filter found (not counted above)",
+    "visible_nuisance": "immaterial nuisance clear to a matched filter told (not counted above "
+    "where it is told by its name)",
     "material_nuisance": "material nuisance found (not counted above)",
     "missing": "without a diagnosis (not counted above)",
 }
@@ -42,10 +46,16 @@ CLAIM_ROWS = {
 }
 LINES = {
     "immaterial": "immaterial, of any stratum",
-    "masked_85": "masked, 85 % absorbed",
+    "masked_85": "one effect, 85 % absorbed",
+    "snr_over_8": "SNR over 8, immaterial ones too",
+    "suspended": "suspended",
+    "ground": "on the ground",
 }
 VIEWS = {"effect_seen": "effect", "all_seen": "all"}
-FEW = ("detected", "exact_top1", "class_top1", "class_top3", "place_top1", "set_covers")
+FEW = (
+    *("detected", "exact_top1", "class_top1", "class_top3", "found_or_split", "place_top1"),
+    "set_covers",
+)
 
 
 def markdown(scores: Mapping[str, Any]) -> str:
