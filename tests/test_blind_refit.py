@@ -69,6 +69,32 @@ def test_a_refit_never_leaves_more_than_none() -> None:
     assert offs[0] == refit.begun().off
 
 
+def test_noise_with_a_memory_hides_what_is_as_slow() -> None:
+    """A change that lasts counts as (1 - m) / (1 + m) of as many readings of white noise."""
+    world, values = known("servo_bench")
+    shown = plans(world.robot, "bench")[SLOW]
+    origin = Reference.of(world, shown, values)
+    lasting = {name: readings + 0.01 for name, readings in origin.stacked().items()}
+    white, coloured = (
+        Refit(origin, lasting, Noise(memory=memory)).begun().off for memory in (0.0, 0.8)
+    )
+    count = len(shown[0].time)
+    assert white == pytest.approx(0.01 * np.sqrt(count) / NOISE.sigma)
+    assert coloured == pytest.approx(white * np.sqrt((0.2 / 1.8 * (count - 1) + 1) / count))
+
+
+def test_what_the_imu_alone_tells_may_be_material() -> None:
+    """Roll and pitch count as joints do, in their own noise."""
+    world, values = known("darwin_op2")
+    origin = Reference.of(world, plans(world.robot, "ground"), values)
+    (sway,) = origin.seen.values()
+    assert sway.tilt is not None
+    seen = {"sway": replace(sway, tilt=sway.tilt + np.array([0.0, 0.01]))}
+    told = visibility(origin, seen, NOISE)
+    assert told.raw == pytest.approx(0.01 / NOISE.imu * NOISE.sigma)
+    assert told.document()["material"]
+
+
 def test_what_a_refit_leaves_is_told_with_what_it_moved() -> None:
     refit, _ = refit_to("servo_bench", kp=0.8)
     other, _ = known("servo_bench", kp=0.8)

@@ -23,13 +23,14 @@ class Visibility:
     """What an effect does to the readings, training motions unless told otherwise.
 
     Attributes:
-      raw: rms over the readings of the joint that shows most, before a refit, rad.
+      raw: rms over the readings of the channel that shows most, a joint, roll or pitch, before a
+        refit; rad, of roll and pitch as many standard deviations of their noise in a joint's.
       left: the same after a refit.
       snr: matched-filter signal to noise of all readings after a refit.
-      absorbed: share of the rms of all readings that a refit hides.
+      absorbed: share of that signal, before a refit, that it hides.
       held_out: as `left`, on the training or the test motions, whichever show more, in units of
         sigma: the engine may leave out any of the former, the scorer keeps the latter.
-      held_out_all: the same over all joints.
+      held_out_all: the same over all channels.
       tested: rms over all joints of what a refit leaves of the test motions, rad; None where there
         are none.
       absorbed_by: relative change of each nominal parameter.
@@ -48,7 +49,7 @@ class Visibility:
 
     @property
     def gain(self) -> float:
-        """What a complete model wins on held-out motions in that joint, in units of sigma."""
+        """What a complete model wins on held-out motions in that channel, in units of sigma."""
         return float(np.hypot(1.0, self.held_out) - 1.0)
 
     def document(self) -> dict[str, Any]:
@@ -91,17 +92,18 @@ def view(refit: Refit, fit: Fit) -> Visibility:
     """What a fit leaves, compared with what there was before a refit."""
     origin, sigma = refit.origin, refit.noise.sigma
     before = refit.still(origin.values, origin.stacked())
+    joints = len(origin.world.robot.joints)
     apart = [_rms(refit, refit.missed(fit, origin.train), origin.train)]
     tested = None
     if origin.test:
         apart.append(_rms(refit, refit.missed(fit, origin.test), origin.test))
-        tested = _root_mean_square(apart[-1]) * sigma
+        tested = _root_mean_square(apart[-1][:joints]) * sigma
     return Visibility(
-        raw=float(_rms(refit, before.rest, origin.train).max()) * sigma,
+        raw=float(_rms(refit, refit.missed(before, origin.train), origin.train).max()) * sigma,
         left=float(apart[0].max()) * sigma,
         snr=fit.left,
         absorbed=1.0 - fit.left / before.off if before.off else 0.0,
-        held_out=float(np.max(apart)),
+        held_out=max(float(rms.max()) for rms in apart),
         held_out_all=max(map(_root_mean_square, apart)),
         tested=tested,
         absorbed_by={
@@ -138,15 +140,14 @@ def _spans(refit: Refit, fit: Fit) -> list[dict[str, Any]]:
 
 
 def _root_mean_square(rms: Array) -> float:
-    """Root mean square over joints of as many readings each."""
+    """Root mean square over channels of as many readings each."""
     return float(np.sqrt(np.mean(rms**2)))
 
 
 def _rms(refit: Refit, values: Array, plans: Sequence[Plan]) -> Array:
-    """Root mean square per joint of a value for each reading of some plans, shape (joints,)."""
+    """Root mean square per channel of a value for each reading of some plans, (n_channels,)."""
     columns = np.concatenate([refit.origin.weights(plan, refit.noise)[1] for plan in plans])
-    joints = range(len(refit.origin.world.robot.joints))
-    return np.array([np.sqrt(np.mean(values[columns == joint] ** 2)) for joint in joints])
+    return np.sqrt(np.bincount(columns, values**2) / np.bincount(columns))
 
 
 def labelled(stratum: str, seen: Mapping[str, Any], sigma: float) -> str:

@@ -22,7 +22,6 @@ from pup.robot import RobotDescription
 SAME = 0.1  # relative, to which the truth must be what the key tells of it before a refit
 EDGE = 1e-9  # relative, by which a parameter may be past its bounds
 VIEWS = ("effect_seen", "all_seen")
-HELD_OUT = ("after_refit_test_rms_rad", "held_out_gain_sigma", "held_out_gain_sigma_all_joints")
 VERDICTS = ("mismatch", "none", "undetermined")
 
 Lower = dict[str, dict[str, float]]
@@ -165,14 +164,7 @@ def _nearer(told: Mapping[str, Any], found: Visibility) -> Mapping[str, Any]:
     """
     if found.absorbed <= told["absorbed"]:
         return told
-    fresh = found.document()
-    snr = _whole(told) * (1.0 - found.absorbed)
-    least = {
-        name: min((v for v in (told.get(name), fresh[name]) if v is not None), default=None)
-        for name in HELD_OUT
-    }
-    material = bool(told.get("material", True)) and fresh["material"]
-    return {**fresh, **least, "snr": snr, "material": material}
+    return {**found.document(), "snr": _whole(told) * (1.0 - found.absorbed)}
 
 
 def _relabelled(truth: dict[str, Any], lower: Lower) -> dict[str, Any]:

@@ -143,10 +143,13 @@ class Reference:
         ]
 
     def weights(self, plan: Plan, noise: Noise) -> tuple[Array, Indices]:
-        """One over the standard deviation of every reading in a row, and its joint; -1 for none."""
+        """One over the standard deviation of every reading in a row, and its channel.
+
+        Channels are joints, then roll and pitch.
+        """
         seen = self.seen[plan.id]
         tilts = 0 if seen.tilt is None else seen.tilt.shape[1]
         ticks, joints = seen.position.shape
         weight = [1 / noise.sigma] * joints + [1 / noise.imu] * tilts
-        columns = [*range(joints), *([-1] * tilts)]
+        columns = np.arange(joints + tilts)
         return np.tile(weight, ticks), np.tile(columns, ticks)

@@ -34,7 +34,8 @@ class Fit:
       model: what is simulated with them, by plan id.
       slopes: its change with the parameters, there or near, by plan id.
       sharp: whether those are of these very parameters.
-      rest: how far the model is off on the training plans, in units of the noise.
+      rest: how far the model is off on the training plans, in units of the noise, which is made
+        white where it has a memory.
       steps: relative changes of the parameters that explain most, within bounds of each stride.
       left: how far it would be off after the longest step, by linear theory.
     """
@@ -81,7 +82,7 @@ class Refit:
         """Parameters as they are, from which no step is taken."""
         count = len(values)
         slopes = {name: np.zeros((len(readings), count)) for name, readings in model.items()}
-        rest, _ = self._weighed(model, slopes, self.origin.train)
+        rest, _ = self._white(model, slopes, self.origin.train)
         off = float(np.linalg.norm(rest))
         return Fit(values, model, slopes, False, rest, (np.zeros(count),), off)
 
@@ -142,10 +143,28 @@ class Refit:
         slopes: Mapping[str, Array],
         sharp: bool,
     ) -> Fit:
-        rest, table = self._weighed(model, slopes, self.origin.train)
+        rest, table = self._white(model, slopes, self.origin.train)
         steps = _solved(table, rest, _bounds(values, self.origin.values))
         left = float(np.linalg.norm(rest - table @ steps[0]))
         return Fit(values, model, slopes, sharp, rest, steps, left)
+
+    def _white(
+        self, model: Mapping[str, Array], slopes: Mapping[str, Array], plans: Sequence[Plan]
+    ) -> tuple[Array, Array]:
+        """Differences and slopes in units of the noise, as if each reading had its own.
+
+        Noise with a memory hides what changes slowly, as it does itself.
+        """
+        rest, table = [], []
+        for plan in plans:
+            both = np.column_stack(self._weighed(model, slopes, [plan]))
+            told = both.reshape(len(plan.time), -1, both.shape[1])
+            memory, fresh = self.noise.memory, np.sqrt(1 - self.noise.memory**2)
+            told = np.concatenate([told[:1], (told[1:] - memory * told[:-1]) / fresh])
+            both = told.reshape(both.shape)
+            rest.append(both[:, 0])
+            table.append(both[:, 1:])
+        return np.concatenate(rest), np.concatenate(table)
 
     def _weighed(
         self, model: Mapping[str, Array], slopes: Mapping[str, Array], plans: Sequence[Plan]
