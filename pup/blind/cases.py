@@ -105,7 +105,8 @@ def _finished(draft: Draft, rng: np.random.Generator, id: str, strict: bool) -> 
         draft, seen, alone = _tuned(draft, reference)
         each = _each(draft, reference) if len(draft.effects) > 1 else [alone]
         stratum = labelled(draft.stratum, alone.document(), draft.noise.sigma)
-        faint = draft.stratum != "unidentifiable" and alone.snr < FAINT
+        floor = CLEAR if draft.stratum == "unlisted" else FAINT
+        faint = draft.stratum != "unidentifiable" and alone.snr < floor
         missed = stratum != draft.stratum and (
             strict or (draft.stratum in ("single", "masked") and stratum == "weak")
         )
