@@ -192,7 +192,9 @@ def _omissions(cases: Sequence[Judged]) -> dict[str, Any]:
         "unidentifiable_allowed": share([_left_open(c) for c in open_]),
         "unlisted_flagged": share([c.unknown for c in cases if c.stratum == "unlisted"]),
         "listed_flagged_unknown": share([c.unknown for c in listed]),
-        "ambiguous_with_next_recording": share([c.next for c in cases if c.ambiguous]),
+        "ambiguous_with_next_recording": share(
+            [c.next for c in cases if c.ambiguous and c.covered]
+        ),
         "undetermined_with_next_recording": share(
             [c.next for c in cases if c.verdict == "undetermined"]
         ),
