@@ -199,7 +199,9 @@ class Linear:
         self.asked += len(rows)
         return np.array([self.matrix @ [row["a"], row["b"]] for row in rows])
 
-    def together(self, asked: list[tuple[list[dict[str, float]], list[int]]]) -> list[np.ndarray]:
+    def together(
+        self, asked: list[tuple[list[dict[str, float]], list[int]]], coarse: bool = False
+    ) -> list[np.ndarray]:
         return [self(rows) for rows, _ in asked]
 
 

@@ -7,7 +7,7 @@ from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.impulses import responses
 from pup.diagnosis.noise import assumed_noise
-from pup.diagnosis.probing import probed
+from pup.diagnosis.probing import changes, probed
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.recording import load_recordings
@@ -37,6 +37,24 @@ def test_a_change_is_told_of_all_joints_that_feel_it(
     assert replays.simulated - before == (3 if here else 2)
     assert base == pytest.approx(simulated[0], abs=1e-6)
     assert changed == pytest.approx(simulated[1:] - simulated[0], abs=1e-6)
+
+
+def test_changes_in_the_air_are_those_of_shorter_sub_steps(replays: Replays) -> None:
+    stiffer = [{f"kp/{group}": 25.0} for group in ("hip", "knee", "ankle")]
+    asked = [({}, [*stiffer, *DAMPED], [*stiffer, *DAMPED])]
+    ((_, fine),) = probed(asked, replays)
+    (coarse,) = changes(asked, replays)
+    off = np.linalg.norm(coarse - fine, axis=1)
+    assert (off > 0).all()
+    assert (off < 0.03 * np.linalg.norm(fine, axis=1)).all()
+
+
+def test_changes_in_contact_are_those_of_the_robots_own_sub_step() -> None:
+    (run,) = load_recordings([OP2.model_path.parent / "recordings/fall_forward.parquet"])
+    standing = replays_of(Measured.of(OP2, [beginning(run, 0.3)]))
+    asked = [({}, DAMPED, DAMPED)]
+    ((_, fine),) = probed(asked, standing)
+    np.testing.assert_array_equal(changes(asked, standing)[0], fine)
 
 
 def test_a_push_is_told_of_all_joints_that_feel_it(replays: Replays) -> None:

@@ -32,14 +32,15 @@ def changes(
     replays: Replays,
     recordings: Sequence[int] | None = None,
 ) -> list[Array]:
-    """What probes change in the samples; see `probed`."""
-    return [changed for _, changed in probed(asked, replays, recordings)]
+    """What probes change in the samples; see `probed`. In the air in longer sub-steps."""
+    return [changed for _, changed in probed(asked, replays, recordings, coarse=True)]
 
 
 def probed(
     asked: Sequence[Asked],
     replays: Replays,
     recordings: Sequence[int] | None = None,
+    coarse: bool = False,
 ) -> list[tuple[Array, Array]]:
     """Simulations of some rows, and what probes change in them, all in one replay.
 
@@ -47,6 +48,7 @@ def probed(
       asked: some probes, as many in the air as on the ground.
       replays: simulates.
       recordings: simulate these only, and leave the others' samples at zero.
+      coarse: whether sub-steps may be longer, where only changes are asked for.
 
     Returns:
       For each of them its samples, shape (n_samples,), and the changes, shape (n_probes,
@@ -77,7 +79,7 @@ def probed(
         calls.append(
             ([r for here, _, p in asked for r in (here, *({**here, **q} for q in p))], ground)
         )
-    answers = iter(replays.together(calls))
+    answers = iter(replays.together(calls, coarse))
     n = len(measured.values)
     out = [(np.zeros(n), np.zeros((len(probes), n))) for _, probes, _ in asked]
     if fixed:

@@ -7,6 +7,7 @@ computes only the terms it needs. Where batches run, in threads or on a cluster,
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from pup.physics.parameters import Candidates, ParameterSpace
 from pup.physics.push import Push
 from pup.physics.terms import Place, split_column, term_space
 from pup.recording_cuts import beginning
+from pup.robot import RobotDescription
 
 Array = NDArray[np.float64]
 Row = Mapping[str, float]
@@ -26,6 +28,9 @@ BATCH = 384
 """Simulations in a batch, at most."""
 WORTH = 8
 """Simulations that are worth a batch of their own."""
+COARSER, COARSEST = 2, 0.004
+"""Sub-steps of a coarse replay: so many times as long as the robot's, up to so long, s. What they
+miss is alike in two simulations that hardly differ, and so is not in their difference."""
 WIDEST_FIRST = {"group": 1, "joint": 2}
 """Order of kinds of places; all others come first."""
 
@@ -40,6 +45,7 @@ class Batch:
       recordings: which recordings are replayed.
       push: torques from outside.
       until: how much of each recording is replayed, s; all where it is None.
+      coarse: whether it may be in longer sub-steps. With contact it never is.
     """
 
     rows: NDArray[np.int64]
@@ -47,6 +53,7 @@ class Batch:
     recordings: tuple[int, ...]
     push: Push | None = None
     until: float | None = None
+    coarse: bool = False
 
 
 @dataclass(eq=False)
@@ -60,24 +67,33 @@ class Bench:
 
     measured: Measured
     actuator: str = "pd"
-    _simulators: dict[tuple[tuple[int, ...], float | None], tuple[MujocoSimulator, Measured]] = (
-        field(default_factory=dict, repr=False)
+    _simulators: dict[tuple[object, ...], tuple[MujocoSimulator, Measured]] = field(
+        default_factory=dict, repr=False
     )
 
     def run(self, batch: Batch) -> Array:
         """Samples of a batch, shape (n_rows, n_samples of its recordings), rad."""
-        simulator, measured = self.simulator(batch.recordings, batch.until)
+        simulator, measured = self.simulator(batch.recordings, batch.until, batch.coarse)
         return measured.pick(simulator.replay(batch.candidates, batch.push))
 
     def simulator(
-        self, recordings: tuple[int, ...], until: float | None
+        self, recordings: tuple[int, ...], until: float | None, coarse: bool = False
     ) -> tuple[MujocoSimulator, Measured]:
         """The simulator of some recordings, or of how they begin, and their samples."""
-        if (recordings, until) not in self._simulators:
+        key = recordings, until, coarse
+        if key not in self._simulators:
             part = some(self.measured, recordings, until)
-            simulator = MujocoSimulator(part.robot, part.recordings, self.actuator)
-            self._simulators[recordings, until] = simulator, part
-        return self._simulators[recordings, until]
+            rough = coarse and not part.grounded.any()
+            robot = self._coarser if rough else part.robot
+            simulator = MujocoSimulator(robot, part.recordings, self.actuator)
+            self._simulators[key] = simulator, part
+        return self._simulators[key]
+
+    @cached_property
+    def _coarser(self) -> RobotDescription:
+        """The robot in longer sub-steps."""
+        own = self.measured.robot.timestep
+        return replace(self.measured.robot, timestep=max(own, min(COARSER * own, COARSEST)))
 
 
 def some(measured: Measured, recordings: Sequence[int], until: float | None) -> Measured:
@@ -96,7 +112,7 @@ def threads(bench: Bench, count: int) -> Runner:
 
     def run(batches: Sequence[Batch]) -> list[Array]:
         for batch in batches:
-            bench.simulator(batch.recordings, batch.until)
+            bench.simulator(batch.recordings, batch.until, batch.coarse)
         with ThreadPoolExecutor(count) as pool:
             return list(pool.map(bench.run, batches))
 
@@ -144,22 +160,31 @@ class Replays:
         """Measured minus simulated, shape (n_samples,), rad; NaN where the simulation diverged."""
         return np.asarray(self.measured.values - self([row])[0])
 
-    def together(self, asked: Sequence[tuple[Sequence[Row], Sequence[int]]]) -> list[Array]:
+    def together(
+        self, asked: Sequence[tuple[Sequence[Row], Sequence[int]]], coarse: bool = False
+    ) -> list[Array]:
         """Several calls at once, each with its rows and recordings.
 
         Where they are small, one batch of all rows and recordings costs less than one for each.
+
+        Args:
+          asked: the rows, and the recordings that are replayed with them.
+          coarse: see Batch.
         """
         each = sum(len(rows) * len(chosen) for rows, chosen in asked)
         every = tuple(range(len(self.measured.recordings)))
         rows = [row for rows, _ in asked for row in rows]
         if len(rows) * len(every) - each < WORTH * (len(asked) - 1):
-            told = iter(self(rows))
+            told = iter(self._run([(self._batches(rows, every, None, coarse), len(rows))])[0])
             return [
                 np.array([next(told)[self.measured.only(chosen)] for _ in rows])
                 for rows, chosen in asked
             ]
         return self._run(
-            [(self._batches(rows, tuple(chosen), None), len(rows)) for rows, chosen in asked]
+            [
+                (self._batches(rows, tuple(chosen), None, coarse), len(rows))
+                for rows, chosen in asked
+            ]
         )
 
     def narrowed(self, recordings: Sequence[int]) -> "Replays":
@@ -199,7 +224,11 @@ class Replays:
         return round(self.simulated / len(self.measured.recordings))
 
     def _batches(
-        self, rows: Sequence[Row], recordings: tuple[int, ...], push: Push | None
+        self,
+        rows: Sequence[Row],
+        recordings: tuple[int, ...],
+        push: Push | None,
+        coarse: bool = False,
     ) -> list[Batch]:
         effects = [_effects(row) for row in rows]
         order = np.array(sorted(range(len(rows)), key=effects.__getitem__), dtype=np.int64)
@@ -214,6 +243,7 @@ class Replays:
                 self._candidates([rows[i] for i in part]),
                 recordings,
                 None if push is None else replace(push, values=push.values[part]),
+                coarse=coarse,
             )
             for part in np.array_split(order, min(parts, len(rows)))
         ]

@@ -54,7 +54,7 @@ class Store:
         digest = hashlib.sha256(self.digest.encode())
         digest.update("\n".join(batch.candidates.space.names).encode())
         digest.update(np.ascontiguousarray(batch.candidates.values).tobytes())
-        digest.update(repr((batch.recordings, batch.until)).encode())
+        digest.update(repr((batch.recordings, batch.until, batch.coarse)).encode())
         if batch.push is not None:
             digest.update(repr(batch.push.period).encode())
             digest.update(np.ascontiguousarray(batch.push.values).tobytes())
