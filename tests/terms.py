@@ -24,6 +24,7 @@ OP2 = RobotDescription.load("darwin_op2")
 G = 9.81
 SERVO = {"kp/servo": 6.0, "kd/servo": 0.25, "tau_max/servo": 1.2, "armature": 0.003}
 """A servo for the bench that damps its load well."""
+KP, KD, LIMIT = SERVO["kp/servo"], SERVO["kd/servo"], SERVO["tau_max/servo"]
 AT = "@joint:servo"
 STEP = BENCH.timestep
 FREE = 1.3e-6 + SERVO["armature"]  # kg m², without the load

@@ -6,11 +6,13 @@ from terms import (
     AT,
     BENCH,
     FREE,
+    KD,
+    KP,
     LEG,
     LEG_POSE,
     LEVER,
     LIGHT,
-    SERVO,
+    LIMIT,
     STEP,
     Array,
     G,
@@ -21,8 +23,6 @@ from terms import (
     solved,
 )
 from test_simulator import recording
-
-KP, KD, LIMIT = SERVO["kp/servo"], SERVO["kd/servo"], SERVO["tau_max/servo"]
 
 
 def away(**terms: float) -> tuple[Array, Array]:

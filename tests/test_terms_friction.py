@@ -7,8 +7,9 @@ from terms import (
     AT,
     BENCH,
     FREE,
+    KD,
+    KP,
     LIGHT,
-    SERVO,
     STEP,
     Array,
     G,
@@ -19,8 +20,6 @@ from terms import (
 from test_simulator import recording
 
 from pup.physics.terms.friction import GRIP
-
-KP, KD, LIMIT = SERVO["kp/servo"], SERVO["kd/servo"], SERVO["tau_max/servo"]
 
 
 def sliding(speed: float) -> Array:

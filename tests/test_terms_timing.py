@@ -5,13 +5,10 @@ import pytest
 from terms import (
     AT,
     BENCH,
-    SERVO,
     STEP,
     bench,
 )
 from test_simulator import recording
-
-KP, KD, LIMIT = SERVO["kp/servo"], SERVO["kd/servo"], SERVO["tau_max/servo"]
 
 
 def test_late_commands_and_late_readings_are_shifts() -> None:

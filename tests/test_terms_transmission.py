@@ -6,8 +6,8 @@ from terms import (
     AT,
     BENCH,
     INERTIA,
+    KP,
     LEVER,
-    SERVO,
     STEP,
     G,
     bench,
@@ -19,8 +19,6 @@ from terms import (
 from test_simulator import recording
 
 from pup.physics.terms import Place
-
-KP, KD, LIMIT = SERVO["kp/servo"], SERVO["kd/servo"], SERVO["tau_max/servo"]
 
 
 @pytest.mark.parametrize("angle", [0.5, -0.5])
