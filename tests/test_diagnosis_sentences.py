@@ -115,6 +115,12 @@ def test_every_effect_has_a_sentence(op2: Maker, effect: str) -> None:
         ),
         ("thermal_drift", "robot", "thermal_drift", {"kind": "robot", "names": ["darwin_op2"]}),
         ("derivative_kick", "group", "unknown", {"kind": "group", "names": ["hip"]}),
+        (
+            "rising_static_friction",
+            "joint",
+            "unknown",
+            {"kind": "joint", "names": ["l_knee"]},
+        ),
     ],
 )
 def test_the_document_speaks_the_contracts_language(

@@ -224,6 +224,7 @@ def test_the_state_of_every_kind_of_effect_is_in_the_tasks_state() -> None:
     for effect, names in (
         ("backlash", ("drivetrain/position", "drivetrain/velocity")),
         ("stribeck_friction", ("stribeck_friction/bend",)),
+        ("rising_static_friction", ("rising_static_friction/bend", "rising_static_friction/age")),
         ("actuator_lag", ("actuator_lag/lagging",)),
         ("voltage_sag", ("voltage_sag/left",)),
         ("integral_action", ("integral_action/sum",)),

@@ -21,7 +21,7 @@ from terms import (
     weight,
 )
 
-from pup.physics.terms.friction import GRIP
+from pup.physics.terms.friction import GRIP, RESTED
 from pup.physics.terms.transmission import RELAXATION
 
 RUN = steps(BENCH, np.zeros(1), 1.6, "bench")
@@ -117,6 +117,13 @@ def stribeck(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]
     q, v, z = x
     level = 0.05 + 0.06 * np.exp(-abs(v) / 0.5)
     return servo(target - q, v) + weight(q) - level * z / GRIP, [bristle(v, z)]
+
+
+def rising(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
+    q, v, z, age = x
+    level = 0.05 + 0.06 * age / (age + 0.1)
+    rub = level * z / GRIP
+    return servo(target - q, v) + weight(q) - rub, [bristle(v, z), 1 - abs(v) * age / 0.03]
 
 
 def presliding(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
@@ -233,6 +240,13 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
         {"torque": 0.05, "rest": 0.06, "speed": 0.5},
         stribeck,
         (0.0,),
+        INERTIA,
+        4e-4,
+    ),
+    "rising_static_friction": (
+        {"torque": 0.05, "rise": 0.06, "time": 0.1, "slip": 0.03},
+        rising,
+        (0.0, RESTED),
         INERTIA,
         4e-4,
     ),

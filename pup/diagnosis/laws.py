@@ -7,6 +7,7 @@ NAMELESS = "unknown"
 EQUATIONS = {
     "coulomb_friction": "tau -= f_c sgn(qdot), at rest up to f_c",
     "stribeck_friction": "tau -= (f_c + f_r exp(-|qdot|/v_s)) sgn(qdot)",
+    "rising_static_friction": "dry friction f + r a/(a + T), da/dt = 1 - |qdot| a/l",
     "presliding_hysteresis": "tau -= f_c z, dz/dt = (qdot - |qdot| z)/x_0",
     "load_dependent_friction": "tau -= mu |tau_m - tau_e| sgn(qdot)",
     "gear_efficiency": "tau = tau_m - e |tau_m| sgn(qdot)",
@@ -47,6 +48,7 @@ EQUATIONS = {
 WORDS = {
     "coulomb_friction": "dry friction",
     "stribeck_friction": "dry friction that is higher at rest",
+    "rising_static_friction": "dry friction that grows with the time at rest",
     "presliding_hysteresis": "dry friction with an elastic range before it slips",
     "load_dependent_friction": "friction that grows with the load",
     "gear_efficiency": "losses in the gear",

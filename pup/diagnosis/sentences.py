@@ -178,6 +178,15 @@ def _stribeck(f: Facts) -> str:
     )
 
 
+def _rising(f: Facts) -> str:
+    torque, rise, time = f.size["torque"], f.size["rise"], f.speech.quantity(f.size["time"], "s")
+    return (
+        f"{f.at} stick{f.s} more the longer {'they rest' if not f.s else 'it rests'}: dry friction "
+        f"of {f.speech.torque(torque)} rises to up to {f.speech.torque(torque + rise)}, by half of "
+        f"that within {time}."
+    )
+
+
 def _presliding(f: Facts) -> str:
     return (
         f"{f.at} stick{f.s}: dry friction of {f.speech.torque(f.size['torque'])}, which gives like "
@@ -314,6 +323,7 @@ def _grip(f: Facts) -> str:
 _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     "coulomb_friction": _friction,
     "stribeck_friction": _stribeck,
+    "rising_static_friction": _rising,
     "presliding_hysteresis": _presliding,
     "load_dependent_friction": lambda f: (
         f"{f.at} lose{f.s} {percent(2 * f.size['share'])} of the load that it carries to friction."

@@ -41,6 +41,7 @@ from pup.physics.terms.friction import (
     GearEfficiency,
     LoadDependentFriction,
     PreslidingHysteresis,
+    RisingStaticFriction,
     StribeckFriction,
 )
 from pup.physics.terms.learned import LearnedLaw
@@ -89,6 +90,7 @@ TERMS: dict[str, type[Term]] = {
         LoadDependentFriction,
         CoulombFriction,
         StribeckFriction,
+        RisingStaticFriction,
         PreslidingHysteresis,
         FrictionAsymmetry,
         QuadraticDamping,
@@ -113,7 +115,12 @@ TERMS: dict[str, type[Term]] = {
 BEYOND: dict[str, type[Term]] = {LearnedLaw.effect: LearnedLaw}
 """Terms that are no effect of the library; they act after all others."""
 CLASSES: dict[str, tuple[str, ...]] = {
-    "dry_friction": ("coulomb_friction", "stribeck_friction", "presliding_hysteresis"),
+    "dry_friction": (
+        "coulomb_friction",
+        "stribeck_friction",
+        "rising_static_friction",
+        "presliding_hysteresis",
+    ),
     "load_friction": ("load_dependent_friction", "gear_efficiency"),
     "speed_loss": ("quadratic_damping", "torque_speed_limit"),
     "rate_limit": ("target_rate_limit",),
@@ -137,7 +144,7 @@ CLASSES: dict[str, tuple[str, ...]] = {
     "imu": ("imu_misalignment", "imu_delay"),
     "external": ("external_force",),
 }
-UNLISTED = frozenset(("derivative_kick",))
+UNLISTED = frozenset(("derivative_kick", "rising_static_friction"))
 """Effects that the contract has no name for; documents call them `unknown` and give their law."""
 FORMS = {"scan_delay": "measurement_delay"}
 """Effects that are a form of one that the contract names."""

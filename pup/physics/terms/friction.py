@@ -1,5 +1,7 @@
 """Dry friction in its kinds: a bristle that holds until it slips, and what its grip depends on."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,8 @@ Array = NDArray[np.float64]
 
 GRIP = 5e-5
 """How far a joint gives before dry friction slips, rad: what no encoder of a servo would see."""
+RESTED = 1.0
+"""Time for which a joint has rested when a recording starts, s."""
 
 
 class Friction(Term):
@@ -20,7 +24,7 @@ class Friction(Term):
     by the one to come: so a reversal costs what it should wherever in a sub-step it falls.
     """
 
-    state = ("_bend",)
+    state: ClassVar[tuple[str, ...]] = ("_bend",)
 
     def prepare(self) -> None:
         """See Term."""
@@ -91,6 +95,42 @@ class StribeckFriction(Friction):
         n = len(flow.torque)
         fade = np.exp(-np.abs(flow.velocity) / self.values["speed"][:n])
         return self.values["torque"][:n] + self.values["rest"][:n] * fade
+
+
+class RisingStaticFriction(Friction):
+    """Friction that rises while a joint rests, and is worn off as it slides.
+
+    The rise with the time at rest is that of the seven-parameter model (Armstrong-Helouvry, Dupont
+    and Canudas de Wit 1994, table 3); the time is forgotten over a slip, as the state of Dieterich
+    and Ruina is. At a constant speed it is lower the faster, as Stribeck friction is.
+    """
+
+    effect = "rising_static_friction"
+    quantities = (
+        Quantity("torque", "N m", 0.05, 1.0),
+        Quantity("rise", "N m", 0.06, 1.0),
+        Quantity("time", "s", 0.1, 10.0, grid=(0.03, 0.3)),
+        Quantity("slip", "rad", 0.03, 0.3, grid=(0.01, 0.05)),
+    )
+    source = "sizes as of Stribeck friction; time 0 to 200 s (Armstrong-Helouvry et al. 1994)"
+    state = ("_bend", "_age")
+
+    def prepare(self) -> None:
+        """See Term."""
+        super().prepare()
+        self._age = np.full_like(self._bend, RESTED)
+
+    def level(self, flow: Flow) -> Array:
+        """See Friction."""
+        n = len(flow.torque)
+        age, time, slip = self._age[:n], self.values["time"][:n], self.values["slip"][:n]
+        fresh = np.abs(flow.velocity) / np.maximum(slip, 1e-9)
+        lost = -np.expm1(-fresh * self.scene.timestep)
+        # of d(age)/dt = 1 - fresh age; at rest it just grows
+        grown = np.where(fresh > 1e-9, lost / np.maximum(fresh, 1e-9), self.scene.timestep)
+        age[:] = age * (1 - lost) + grown
+        share = age / (age + np.maximum(time, 1e-9))
+        return np.asarray(self.values["torque"][:n] + self.values["rise"][:n] * share)
 
 
 class PreslidingHysteresis(Friction):
