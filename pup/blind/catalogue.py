@@ -299,6 +299,13 @@ _UNLISTED: dict[str, tuple[str, str, Callable[[Kit], float], Shape]] = {
     "quantised_torque": ("level", "N m", lambda k: 0.1 * k.stall, _nothing),
     "speed_dependent_gain": ("change", "1", lambda k: -0.35, _speed(0.05, 0.2)),
     "friction_step": ("torque", "N m", lambda k: 0.1 * k.share, _of(onset=(2.0, 4.5))),
+    "derivative_of_error": (
+        "gain",
+        "N m s/rad",
+        lambda k: 0.008 * k.kp,
+        _of(filter=(0.004, 0.012)),
+    ),
+    "relaxing_harness": ("stiffness", "N m/rad", lambda k: 0.25 * k.share, _of(time=(0.3, 1.2))),
 }
 
 

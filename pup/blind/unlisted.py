@@ -92,6 +92,40 @@ class FrictionStep(Part):
         now.grip[self.at] += self.size / (1.0 + np.exp(-np.clip(4.0 * since, -30.0, 30.0)))
 
 
+class DerivativeOfError(Part):
+    """A derivative gain on the filtered error, which commands kick (Åström and Hägglund)."""
+
+    def begin(self) -> None:
+        """Filtered from the first error on."""
+        self.filtered = np.full(self.lanes, np.nan)
+        self.share = -np.expm1(-self.stage.step / self.shape["filter"])
+
+    def command(self, now: Moment) -> None:
+        """Add the filtered error's change, the mean over a kick in which the error stays."""
+        error = now.error[self.at]
+        if np.isnan(self.filtered).any():
+            self.filtered = error
+        change = self.share * (error - self.filtered)
+        self.filtered = self.filtered + change
+        now.duty[self.at] += self.size * change / self.stage.step
+
+
+class RelaxingHarness(Part):
+    """Cables and covers that yield when held bent: a spring and a dashpot in series (Maxwell)."""
+
+    def begin(self) -> None:
+        """Rested."""
+        self.bent = np.zeros(self.lanes)
+        self.kept = np.exp(-self.stage.step / self.shape["time"])
+
+    def resist(self, now: Moment) -> None:
+        """Pull back, the mean over a kick."""
+        before = self.bent
+        way = self.shape["time"] * (1.0 - self.kept) * now.speed[self.at]
+        self.bent = self.kept * before + way
+        now.passive[self.at] -= self.size * 0.5 * (before + self.bent)
+
+
 def _stairs(height: Array) -> Array:
     """The integral of rounding, from zero."""
     level = np.round(height)
@@ -105,5 +139,7 @@ FORMS: dict[str, type[Part]] = {
     "quantised_torque": QuantisedTorque,
     "speed_dependent_gain": SpeedDependentGain,
     "friction_step": FrictionStep,
+    "derivative_of_error": DerivativeOfError,
+    "relaxing_harness": RelaxingHarness,
 }
 """By the form of an effect named `unknown`."""
