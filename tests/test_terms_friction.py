@@ -124,3 +124,18 @@ def test_a_loaded_gear_costs_torque_going_up_and_saves_it_going_down(
         motor = KP * (run.target[-1, 0] - read[-1]) - KD * speed
         load = mass * G * 0.1 * np.sin(read[-1])
         assert motor == pytest.approx(load * factor, abs=5e-3 * load)
+
+
+@pytest.mark.parametrize(("rested", "holds"), [(0.1, False), (10.0, True)])
+def test_friction_that_rises_at_rest_holds_later_what_it_did_not_at_first(
+    rested: float, holds: bool
+) -> None:
+    """It has risen by a / (a + time) after a rest of a: from a third of its rise to 0.79."""
+    row = {
+        f"rising_static_friction/{name}{AT}": value
+        for name, value in (("torque", 0.05), ("rise", 0.08), ("time", 3.0), ("slip", 0.03))
+    }
+    time = np.arange(0, rested + 1, 0.02)
+    target = np.clip((time - rested) / 0.5, 0, 1) * (0.05 + 0.5 * 0.08) / KP
+    (read,) = bench(recording(BENCH, time, target, setup=LIGHT), row)
+    assert (abs(read[-1]) < 8 * GRIP) == holds
