@@ -7,7 +7,7 @@ NAMELESS = "unknown"
 EQUATIONS = {
     "coulomb_friction": "tau -= f_c sgn(qdot), at rest up to f_c",
     "stribeck_friction": "tau -= (f_c + f_r exp(-|qdot|/v_s)) sgn(qdot)",
-    "rising_static_friction": "dry friction f + r a/(a + T), da/dt = 1 - |qdot| a/l",
+    "rising_static_friction": "tau -= (f_c + f_r a/(a + T)) sgn(qdot), da/dt = 1 - |qdot| a/l",
     "presliding_hysteresis": "tau -= f_c z, dz/dt = (qdot - |qdot| z)/x_0",
     "load_dependent_friction": "tau -= mu |tau_m - tau_e| sgn(qdot)",
     "gear_efficiency": "tau = tau_m - e |tau_m| sgn(qdot)",
