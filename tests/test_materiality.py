@@ -7,7 +7,7 @@ import pytest
 
 from pup.diagnosis.held_out import HeldOut
 from pup.diagnosis.hypotheses import Hypothesis
-from pup.diagnosis.materiality import little, matters
+from pup.diagnosis.materiality import astray, little, matters
 from pup.diagnosis.models import Model
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
@@ -90,3 +90,17 @@ def test_better_are_most_types_of_motion(after: tuple[float, ...], told: bool) -
     motions = dict(zip("abcd", ((2.0, value) for value in after), strict=True))
     held = HeldOut(("a",), 1.0, 2.0, (0.0, 0.0), per_motion=motions)
     assert held.better is told
+
+
+@pytest.mark.parametrize(
+    ("share", "noises", "far"), [(0.1, 0.0, False), (0.7, 0.0, True), (0.0, 2.0, False)]
+)
+def test_a_joint_that_is_not_foretold_at_all_is_told(
+    share: float, noises: float, far: bool
+) -> None:
+    """A servo that swings by itself was followed where it was fitted, and told to lack nothing."""
+    nominal = model(None, 1.0)
+    swing = float(nominal.measured.values.std())
+    ends = (share * swing + noises * SIGMA,) * 2
+    seen = HeldOut(("a", "b"), *ends, (0.0, 0.0), {"servo": ends}, {})
+    assert astray(nominal, seen, MAKER.noise) == ("servo is off by 70% of its swing" if far else "")

@@ -27,7 +27,7 @@ from pup.diagnosis.looks import (
     in_the_air,
     nowhere,
 )
-from pup.diagnosis.materiality import improves, little, matters
+from pup.diagnosis.materiality import astray, improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.noise import assumed_noise, quiet_noise, told_anew
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal, unfitted
@@ -281,9 +281,14 @@ def _judged(task: _Task, nominal: Nominal, done: Search, seen: Sequence[Regime])
         unexplained=left,
         slight=slight,
     )
-    if not model.hypotheses and not left and not odd:
+    if model.hypotheses or left or odd:
+        return _explained(task, told, model, selector, odd)
+    far = astray(final, shown, nominal.noise)
+    if not far:
         return told
-    return _explained(task, told, model, selector, odd)
+    reason = f"nothing was found, but motions left out are not foretold: {far}"
+    ask = recorded_besides(measured, task.seed)
+    return replace(task.told(nominal, seen, "undetermined", reason), ask=ask)
 
 
 def _explained(

@@ -25,6 +25,10 @@ SHOWN, FORETOLD, TRACE = 0.05, 0.1, 0.02
 """The same that an effect of any size shows: on what was fitted, or else on motions left out, of
 which a nominal fit to all may hide much; and what those have to gain at least."""
 
+ASTRAY, NOISY = 0.2, 3.0
+"""Share of its swing, and times its noise, that a joint's error on motions left out may be where
+nothing is missing. A servo that swings by itself does not repeat: its noise alone excuses all."""
+
 
 def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
     """Whether a model with effects is worth having instead of the nominal one.
@@ -46,6 +50,21 @@ def matters(nominal: Model, model: Model, shown: HeldOut, noise: Noise) -> bool:
 def improves(model: Model, shown: HeldOut, noise: Noise) -> bool:
     """Whether motions of some joint or of the torso are foretold better by much, left out."""
     return max(_gains(model, shown, noise)) > FORESEEN
+
+
+def astray(model: Model, shown: HeldOut, noise: Noise) -> str:
+    """Joints whose motions left out a fit does not foretell, in words; empty where it does.
+
+    What swings by itself may be followed where it was fitted, and nowhere else.
+    """
+    measured = model.measured
+    far = []
+    for name, (_, after) in shown.per_joint.items():
+        joint = measured.robot.joint_names.index(name)
+        swing = float(measured.values[measured.channel == joint].std())
+        if after > max(ASTRAY * swing, NOISY * noise.sigma[joint]):
+            far.append(f"{name} is off by {after / swing:.0%} of its swing")
+    return ", ".join(far)
 
 
 def little(model: Model, shown: HeldOut) -> str:
