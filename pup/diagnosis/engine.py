@@ -149,15 +149,11 @@ def diagnose(
     nominal = unfitted(replays, noise) if poor else fit_nominal(replays, noise, rng)
     seen = _regimes(nominal, replays)
 
-    def undetermined(reason: str) -> Diagnosis:
-        ask = _instead(measured, poor, seed)
-        return replace(task.told(nominal, seen, "undetermined", reason), ask=ask)
-
     if poor:
-        return undetermined(poor.reason)
+        return _undetermined(task, nominal, seen, poor.reason, poor)
     nominal, first = _settled(task, nominal)
     if not nominal.certificate.holds:
-        return undetermined(_unsettled(nominal))
+        return _undetermined(task, nominal, seen, _unsettled(nominal))
     done = task.search(nominal, first)
     if done is not None and not task.contact:
         done, first = _looked_again(task, nominal, first, done)
@@ -165,7 +161,8 @@ def diagnose(
         if alone is not None:
             return alone
     if done is None:
-        return undetermined("the motions would not show any effect of the library")
+        reason = "the motions would not show any effect of the library"
+        return _undetermined(task, nominal, seen, reason)
     if nominal.noise.source == "assumed":
         nominal, done = _weighed(task, nominal, done)
     return _judged(task, nominal, done, seen)
@@ -287,8 +284,7 @@ def _judged(task: _Task, nominal: Nominal, done: Search, seen: Sequence[Regime])
     if not far:
         return told
     reason = f"nothing was found, but motions left out are not foretold: {far}"
-    ask = recorded_besides(measured, task.seed)
-    return replace(task.told(nominal, seen, "undetermined", reason), ask=ask)
+    return _undetermined(task, nominal, seen, reason)
 
 
 def _explained(
@@ -326,10 +322,18 @@ def _explained(
     )
 
 
-def _instead(measured: Measured, poor: Poor | None, seed: int) -> NextRecording:
-    """What to record where these recordings tell nothing."""
+def _undetermined(
+    task: _Task,
+    nominal: Nominal,
+    seen: Sequence[Regime],
+    reason: str,
+    poor: Poor | None = None,
+) -> Diagnosis:
+    """No verdict, why, and what to record where these recordings tell nothing."""
     cure = poor.cure if poor else ""
-    return recorded_again(measured, cure) if cure else recorded_besides(measured, seed)
+    measured = task.measured
+    ask = recorded_again(measured, cure) if cure else recorded_besides(measured, task.seed)
+    return replace(task.told(nominal, seen, "undetermined", reason), ask=ask)
 
 
 def _matters(

@@ -61,8 +61,9 @@ def astray(model: Model, shown: HeldOut, noise: Noise) -> str:
     far = []
     for name, (_, after) in shown.per_joint.items():
         joint = measured.robot.joint_names.index(name)
-        swing = float(measured.values[measured.channel == joint].std())
-        if after > max(ASTRAY * swing, NOISY * noise.sigma[joint]):
+        sigma = float(noise.sigma[joint])
+        swing = max(float(measured.values[measured.channel == joint].std()), sigma)
+        if after > max(ASTRAY * swing, NOISY * sigma):
             far.append(f"{name} is off by {after / swing:.0%} of its swing")
     return ", ".join(far)
 

@@ -182,8 +182,8 @@ def _rising(f: Facts) -> str:
     torque, rise, time = f.size["torque"], f.size["rise"], f.speech.quantity(f.size["time"], "s")
     return (
         f"{f.at} stick{f.s} more the longer {'they rest' if not f.s else 'it rests'}: dry friction "
-        f"of {f.speech.torque(torque)} rises to up to {f.speech.torque(torque + rise)}, by half of "
-        f"that within {time}."
+        f"of {f.speech.torque(torque)} rises up to {f.speech.torque(torque + rise)}, half of "
+        f"the rise within {time}."
     )
 
 

@@ -120,16 +120,19 @@ class RisingStaticFriction(Friction):
         super().prepare()
         self._age = np.full_like(self._bend, RESTED)
 
+    def flow(self, flow: Flow) -> None:
+        """See Friction: the age by d(age)/dt = 1 - fresh age, which at rest just grows."""
+        n = len(flow.torque)
+        fresh = np.abs(flow.velocity) / np.maximum(self.values["slip"][:n], 1e-9)
+        lost = -np.expm1(-fresh * self.scene.timestep)
+        grown = np.where(fresh > 1e-9, lost / np.maximum(fresh, 1e-9), self.scene.timestep)
+        self._age[:n] = self._age[:n] * (1 - lost) + grown
+        super().flow(flow)
+
     def level(self, flow: Flow) -> Array:
         """See Friction."""
         n = len(flow.torque)
-        age, time, slip = self._age[:n], self.values["time"][:n], self.values["slip"][:n]
-        fresh = np.abs(flow.velocity) / np.maximum(slip, 1e-9)
-        lost = -np.expm1(-fresh * self.scene.timestep)
-        # of d(age)/dt = 1 - fresh age; at rest it just grows
-        grown = np.where(fresh > 1e-9, lost / np.maximum(fresh, 1e-9), self.scene.timestep)
-        age[:] = age * (1 - lost) + grown
-        share = age / (age + np.maximum(time, 1e-9))
+        share = self._age[:n] / (self._age[:n] + np.maximum(self.values["time"][:n], 1e-9))
         return np.asarray(self.values["torque"][:n] + self.values["rise"][:n] * share)
 
 
