@@ -7,6 +7,7 @@ import pytest
 
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.residuals import Measured
+from pup.physics.terms import Place
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
 from tests.diagnoses import MOTIONS, recordings
@@ -36,6 +37,23 @@ def test_a_force_from_outside_is_looked_for_where_several_joints_feel_it(
     assert {h.place.name for h in told if h.effect == "external_force"} == bodies
     loads = {h.place.name for h in told if h.effect == "payload"}
     assert bodies < loads  # any link may carry something
+
+
+@pytest.mark.parametrize(
+    ("name", "link", "joint"),
+    [("servo_bench", "arm", "servo"), ("darwin_leg", "l_ank_pitch_link", "l_ank_pitch")],
+)
+def test_a_links_flex_is_a_sibling_of_the_compliance_of_the_joint_that_moves_it(
+    name: str, link: str, joint: str
+) -> None:
+    robot = RobotDescription.load(name)
+    told = {h.key: h for h in hypotheses(Measured.of(robot, recordings(robot, 60, MOTIONS)))}
+    flex = told["structural_flex", Place("body", link)]
+    compliances = [h for h in told.values() if h.effect == "joint_compliance"]
+    siblings = [h.place for h in compliances if h.sibling_of(flex)]
+    assert siblings == [Place("joint", joint)]
+    dry = told["coulomb_friction", Place("joint", joint)]
+    assert not flex.sibling_of(dry)
 
 
 @pytest.mark.parametrize("hanging", [(), ("step_0.1_0",)])

@@ -10,15 +10,13 @@ from hypothesis import strategies as st
 
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together
-from pup.diagnosis.noise import assumed_noise, told_anew
+from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.reweighing import Reweighing
 from pup.diagnosis.search import Search, search, search_on
 from pup.physics.parameters import robot_space
-from pup.robot import RobotDescription
-from tests.diagnoses import Maker
 from tests.diagnosis_cases import BENCH, recordings
 
 MISSING = {"coulomb_friction/torque@joint:servo": 0.03}
@@ -121,22 +119,3 @@ def test_what_was_found_by_too_little_noise_is_given_up(
     further = search_on(done, replays, weighed(nominal, loud), np.random.default_rng(1), quiet)
     assert not further.model.hypotheses
     assert further.model is further.selector.nominal
-
-
-def test_what_a_model_is_wrong_at_is_no_noise() -> None:
-    measured = bench().measured
-    before = noise(2e-3, 0.0)
-    assert told_anew(before, noise(2.1e-3, 0.1), measured) is None  # the same
-    assert told_anew(before, noise(4e-3, 0.0), measured) is None  # wrong at every joint
-    assert told_anew(before, noise(3e-3, 0.0), measured) is not None
-    assert told_anew(before, noise(2e-3, 0.4), measured) is not None
-
-
-def test_one_joint_astray_keeps_its_noise_and_stops_nothing() -> None:
-    measured = Maker(RobotDescription.load("darwin_leg")).measured
-    before = Noise(np.full(8, 2e-3), np.zeros(8), "assumed")
-    told = before.sigma.copy()
-    told[[0, 1]] = 5e-3, 3e-3
-    after = told_anew(before, replace(before, sigma=told), measured)
-    assert after is not None
-    assert after.sigma == pytest.approx([2e-3, 3e-3, *[2e-3] * 6])

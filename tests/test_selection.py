@@ -293,6 +293,27 @@ def test_a_motion_that_is_lost_hides_nothing_in_others(followed: bool) -> None:
     assert not selector._beyond_forms(off(5.0, 1.2), off(4.9, 1.2))
 
 
+@pytest.mark.parametrize(
+    ("known", "left", "told"),
+    [(FIRST, 1.05, True), (FIRST, 1.2, False), (SOFT, 1.05, False)],
+)
+def test_an_effect_that_explains_nearly_all_that_is_left_is_no_wrong_form(
+    known: Hypothesis, left: float, told: bool
+) -> None:
+    """Beside a limit of the rate that explains 1,600 times as much; but all of contact is rough."""
+
+    def off(by: float, *effects: Hypothesis) -> Model:
+        model = made((FIRST,), by * MAKER.samples)
+        fit = replace(model.fit, residual=np.full(MAKER.samples, np.sqrt(by)))
+        return replace(model, hypotheses=effects, fit=fit)
+
+    selector = Made({})
+    selector.nominal, selector.followed = off(2000.0), None
+    before, after = off(1.4, known), off(left, known, LAST)
+    assert not selector._beyond_forms(before, after)
+    assert selector._completes(before, after) is told
+
+
 @pytest.mark.parametrize(("left", "looked"), [(50.0, True), (5.0, False)])
 def test_where_all_that_was_tried_leaves_many_times_the_noise_more_are_tried(
     monkeypatch: pytest.MonkeyPatch, left: float, looked: bool

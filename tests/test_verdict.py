@@ -167,6 +167,30 @@ def test_what_has_no_name_is_no_surer_than_a_name_that_is_likely(
     assert beside(nameless, named, BENCH).probability == after
 
 
+@pytest.mark.parametrize(("likely", "first"), [(0.3, "cogging"), (0.2, "unknown")])
+def test_what_has_no_name_is_first_where_it_is_surer_than_what_has(
+    likely: float, first: str
+) -> None:
+    """However much it explains: a torque that may be anything explains the most."""
+    nameless, clock = found("unknown", 9000.0, np.inf, 0.25), found("clock_skew", 20.0, 0.2)
+    told = in_order([nameless, found("cogging", 400.0, 0.4, likely), clock])
+    assert told[0].effect == first
+    assert [f.gain for f in told if f.effect != first] == sorted(
+        (f.gain for f in told if f.effect != first), reverse=True
+    )
+
+
+def test_a_flex_of_a_link_and_a_compliance_of_its_joint_are_one_cause() -> None:
+    joint = Place("joint", BENCH.joint_names[0])
+    compliant = found("joint_compliance", 50.0, 1.0, 0.6)
+    flex = replace(found("structural_flex", 900.0, 1.0), place=Place("body", "arm"), seat=joint)
+    told = shared([flex, compliant])
+    assert [e.effect for e in told[0].equivalents] == ["joint_compliance"]
+    assert told[0].of_class == pytest.approx(0.9)
+    apart = replace(flex, seat=Place("joint", "another"))
+    assert shared([apart, compliant]) == [apart, compliant]
+
+
 def test_what_explains_nearly_all_is_first_whatever_its_size() -> None:
     drag, spring = found("quadratic_damping", 10_200.0, 0.23), found("joint_spring", 220.0, 0.45)
     assert in_order([spring, drag]) == (drag, spring)
@@ -207,6 +231,14 @@ def test_an_interval_is_as_wide_as_a_law_of_another_form_asks() -> None:
     shape = next(q for q in TERMS["stribeck_friction"].quantities if q.shape)
     speed = Parameter(0.1, "rad/s", 0.09, 0.11)
     assert of_other_form(speed, shape) == speed
+
+
+def test_what_has_no_name_is_no_surer_than_the_first_that_is_likely() -> None:
+    """What is found later, of the little that is left, may be as sure as it likes."""
+    late, drag = found("actuator_lag", 900.0, 1.0, 0.6), found("quadratic_damping", 90.0, 1.0, 0.9)
+    nameless = found("unknown", 5.0, np.inf, 0.8)
+    assert beside(nameless, [late, drag], BENCH).probability == 0.6
+    assert beside(nameless, [replace(late, probability=0.4), drag], BENCH).probability == 0.8
 
 
 @pytest.mark.parametrize(("other", "after"), [("measurement_delay", 0.47), ("cogging", 0.65)])

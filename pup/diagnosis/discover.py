@@ -131,14 +131,14 @@ def unexplained(
 
 
 def beside(nameless: Finding, named: Sequence[Finding], robot: RobotDescription) -> Finding:
-    """What has no name beside what has one there: no surer than a name whose class is likely.
+    """What has no name beside what has one there: no surer than the first whose class is likely.
 
     How much a name leaves on motions that were left out may only say that no other motion tells how
     strong a servo is, or that the effect has a form of its own: of that name it is a part.
     """
     there = [f for f in named if _meet(f.place, nameless.place, robot)]
-    surest = max((f.probability for f in there if f.of_class >= LIKELY), default=1.0)
-    return replace(nameless, probability=min(nameless.probability, surest))
+    first = next((f.probability for f in there if f.of_class >= LIKELY), 1.0)
+    return replace(nameless, probability=min(nameless.probability, first))
 
 
 def _meet(one: Place, other: Place, robot: RobotDescription) -> bool:

@@ -29,10 +29,10 @@ from pup.diagnosis.looks import (
 )
 from pup.diagnosis.materiality import astray, improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
-from pup.diagnosis.noise import assumed_noise, quiet_noise, told_anew
+from pup.diagnosis.noise import assumed_noise, told_anew
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal, unfitted
 from pup.diagnosis.pieces import origins, pieces
-from pup.diagnosis.poor import Poor, why_poor
+from pup.diagnosis.poor import why_poor
 from pup.diagnosis.regimes import Regime, regimes
 from pup.diagnosis.repeatability import unrepeated
 from pup.diagnosis.replays import Replays, Runner
@@ -53,6 +53,11 @@ Progress = Callable[[str, float], None]
 ALONE = 0.5
 """Mean square of a channel's errors beyond its noise, in that of the noise, from which something
 that has no name is told though no law of it predicts motions left out."""
+
+LOUDER = (
+    "errors are larger than the noise that was assumed, but no effect and no law foretells them "
+    "on motions left out; with nothing recorded twice, they may be noise"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +155,7 @@ def diagnose(
     seen = _regimes(nominal, replays)
 
     if poor:
-        return _undetermined(task, nominal, seen, poor.reason, poor)
+        return _undetermined(task, nominal, seen, poor.reason, poor.cure)
     nominal, first = _settled(task, nominal)
     if not nominal.certificate.holds:
         return _undetermined(task, nominal, seen, _unsettled(nominal))
@@ -239,7 +244,7 @@ def _weighed(task: _Task, nominal: Nominal, done: Search) -> tuple[Nominal, Sear
     """
     measured, replays = task.measured, task.replays
     errors = replays.errors(done.model.fit.row())
-    noise = told_anew(nominal.noise, quiet_noise(measured, errors), measured)
+    noise = told_anew(nominal.noise, measured, errors)
     if noise is None:
         return nominal, done
     fit = Fit(nominal.fit.coordinates, nominal.fit.at)
@@ -278,6 +283,8 @@ def _judged(task: _Task, nominal: Nominal, done: Search, seen: Sequence[Regime])
         unexplained=left,
         slight=slight,
     )
+    if left and not odd and _only_louder(model, left, shown, nominal.noise):
+        return _undetermined(task, nominal, seen, LOUDER, "each of them twice")
     if model.hypotheses or left or odd:
         return _explained(task, told, model, selector, odd)
     far = astray(final, shown, nominal.noise)
@@ -327,10 +334,9 @@ def _undetermined(
     nominal: Nominal,
     seen: Sequence[Regime],
     reason: str,
-    poor: Poor | None = None,
+    cure: str = "",
 ) -> Diagnosis:
-    """No verdict, why, and what to record where these recordings tell nothing."""
-    cure = poor.cure if poor else ""
+    """No verdict, why, and what to record; `cure` is what helps where that is the same again."""
     measured = task.measured
     ask = recorded_again(measured, cure) if cure else recorded_besides(measured, task.seed)
     return replace(task.told(nominal, seen, "undetermined", reason), ask=ask)
@@ -347,6 +353,13 @@ def _matters(
     if left.excess > ALONE:
         return True
     return improves(model, shown, noise) if model.hypotheses else shown.interval[0] > 0
+
+
+def _only_louder(model: Model, left: Unexplained, shown: HeldOut, noise: Noise) -> bool:
+    """Whether all there is to tell is more noise than was assumed, where nothing was repeated."""
+    if noise.source == "repeats" or model.hypotheses or left.terms:
+        return False
+    return shown.interval[0] <= 0
 
 
 def _next(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +37,7 @@ class Hypothesis:
       scale: of the robot.
       shape: values of its shape quantities, by column.
       sign: of the sizes that it is first tried in.
+      joint: of a link, the joint that moves it; else empty.
     """
 
     effect: str
@@ -43,6 +45,7 @@ class Hypothesis:
     scale: Scale
     shape: tuple[tuple[str, float], ...] = ()
     sign: float = 1.0
+    joint: str = ""
 
     @property
     def family(self) -> str:
@@ -54,10 +57,15 @@ class Hypothesis:
         """What it claims, whatever its shape."""
         return self.effect, self.place
 
+    @property
+    def seat(self) -> Place:
+        """Where it shows: a link's flex bends what its joint's play would let go."""
+        return Place("joint", self.joint) if self.joint else self.place
+
     def sibling_of(self, other: "Hypothesis") -> bool:
         """Whether both are forms of one class at one place; each is its own sibling."""
         everywhere = self.place.kind in EVERYWHERE and other.place.kind in EVERYWHERE
-        return self.family == other.family and (self.place == other.place or everywhere)
+        return self.family == other.family and (self.seat == other.seat or everywhere)
 
     @property
     def form(self) -> tuple[float, ...]:
@@ -124,8 +132,9 @@ def hypotheses(measured: Measured) -> list[Hypothesis]:
     """All hypotheses about some measurements, but for what the robot's description has already."""
     scale = Scale.of(measured.robot)
     known = {(term.effect, Place(term.kind, term.name)) for term in measured.robot.terms}
+    movers = _movers(measured)
     return [
-        Hypothesis(effect, place, scale, shape, sign)
+        Hypothesis(effect, place, scale, shape, sign, movers.get(place, ""))
         for effect, term in TERMS.items()
         for place in _places(effect, measured)
         if (effect, place) not in known
@@ -194,11 +203,30 @@ def _places(effect: str, measured: Measured) -> Iterator[Place]:
             yield Place(kind)
 
 
+def _compiled(measured: Measured) -> mujoco.MjModel:
+    """The robot on the ground if it ever is, else as it was recorded."""
+    supports = {r.support for r in measured.recordings}
+    support = "ground" if "ground" in supports else next(iter(supports))
+    return compile_model(measured.robot, support).compiled
+
+
+def _movers(measured: Measured) -> dict[Place, str]:
+    """Of each link that a joint of the robot moves, that joint: the nearest one above it."""
+    model = _compiled(measured)
+    moved = {int(model.joint(name).bodyid[0]): name for name in measured.robot.joint_names}
+    nearest: dict[int, str] = {}
+    for body in range(1, model.nbody):  # parents come before their children
+        joint = moved.get(body) or nearest.get(int(model.body_parentid[body]))
+        if joint:
+            nearest[body] = joint
+    return {Place("body", model.body(body).name): joint for body, joint in nearest.items()}
+
+
 def _bodies(effect: str, measured: Measured, ground: bool) -> Iterator[Place]:
     """Bodies whose motion the data can show: links that joints move, and a free torso."""
     robot = measured.robot
     supports = {r.support for r in measured.recordings}
-    model = compile_model(robot, "ground" if ground else next(iter(supports))).compiled
+    model = _compiled(measured)
     carried = [int(model.joint(name).bodyid[0]) for name in robot.joint_names]
     if effect == "structural_flex":
         yield from (Place("body", model.body(b).name) for b in dict.fromkeys(carried))

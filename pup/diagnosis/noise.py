@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.lateness import NORMAL_MIDDLE, Difference, lateness, trimmed
 from pup.diagnosis.residuals import Measured, Noise
+from pup.diagnosis.steady import steady
 from pup.physics.terms.scale import Scale
 from pup.recording import Recording
 
@@ -122,20 +123,22 @@ def quiet_noise(measured: Measured, errors: Array) -> Noise:
     return _pooled(measured, told, "assumed", 0)
 
 
-def told_anew(before: Noise, after: Noise, measured: Measured) -> Noise | None:
+def told_anew(before: Noise, measured: Measured, errors: Array) -> Noise | None:
     """Noise to weigh by from now on, by what a model leaves; None where it stays as it was.
 
     A channel that the model is wrong at keeps what it had, and where it is wrong at most of them,
-    what it leaves says nothing of noise.
+    what it leaves says nothing of noise. Wrong is a model that leaves much more than was thought,
+    unless that is noise by its looks: how errors flicker tells little of noise with a memory.
 
     Args:
       before: the noise that the model was fitted by.
-      after: the noise that it leaves.
       measured: the samples.
+      errors: measured minus simulated, shape (n_samples,), rad.
     """
+    after = quiet_noise(measured, errors)
     seen = np.unique(measured.channel)
     larger = after.sigma / before.sigma
-    astray = larger > ASTRAY
+    astray = (larger > ASTRAY) & ~steady(measured, errors)
     same = np.abs(larger - 1) < SAME_SIGMA
     unchanged = same & (np.abs(after.rho - before.rho) < SAME_RHO)
     if unchanged.all() or np.mean(astray[seen]) > 0.5:

@@ -59,6 +59,10 @@ FORM, OF_CONTACT = 0.03, 0.25
 """Share of its own trace by which an effect's form may be wrong: what is left of one that was found
 is no evidence of another. Of contact another impedance and integrator leave a fifth, even the same
 law at another time step a tenth (docs/results/diagnosis.md)."""
+WHOLE = 0.7
+"""Share of what is left beyond noise from which an effect is the law of it, however little it is
+next to what was found before: a flex behind a limit of the rate that explains 1,600 times as much.
+"""
 
 
 class Selector:
@@ -246,6 +250,15 @@ class Selector:
         near, nearby = inside[self.followed].sum(), allowed[self.followed].sum()
         return bool(near > max(nearby, self.enough))
 
+    def _completes(self, before: Model, after: Model) -> bool:
+        """Whether an effect explains nearly all that those before it leave beyond noise.
+
+        A wrong form leaves errors of its own, of which no other effect is the law.
+        """
+        if any(map(in_contact, before.hypotheses)):
+            return False
+        return before.fit.chi2 - after.fit.chi2 > WHOLE * spare(before)
+
     def _refit(self, tried: Sequence[Tried], start: float) -> None:
         """Refit finalists: all for a first look, the promising roughly, the best to the end.
 
@@ -289,7 +302,7 @@ class Selector:
         outside = float((before.held_out - after.held_out).sum())
         if outside <= max(KEPT * inside, 0.5 * self.enough):
             return False
-        if not self._beyond_forms(before, after):
+        if not (self._beyond_forms(before, after) or self._completes(before, after)):
             return False
         newest, known = after.hypotheses[-1], _effects(before.hypotheses)
         both, measured = (before.fit, after.fit), self.replays.measured

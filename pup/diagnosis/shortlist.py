@@ -78,9 +78,8 @@ def shortlist(
     first = ranking[0].trace.hypothesis
     for score in ranking:
         other = score.trace.hypothesis
-        everywhere = other.place.kind in EVERYWHERE
-        same = other.place == first.place or (everywhere and first.place.kind in EVERYWHERE)
-        alike = (other.family == first.family and same) or (everywhere and other.effect in shared)
+        spread = other.place.kind in EVERYWHERE and other.effect in shared
+        alike = other.sibling_of(first) or spread
         if alike or (contact and in_contact(other)):
             best.setdefault((other.key, other.choices), score)
     return list(best.values())

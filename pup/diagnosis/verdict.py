@@ -12,7 +12,7 @@ from pup.diagnosis.evidence import overlap
 from pup.diagnosis.folds import scatter
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.jitter import jitter
-from pup.diagnosis.laws import EQUATIONS
+from pup.diagnosis.laws import EQUATIONS, NAMELESS
 from pup.diagnosis.locate import BAND
 from pup.diagnosis.models import TEMPERATURE, Model, Round, chosen_in
 from pup.diagnosis.regimes import Regime, Window, strongest, windows
@@ -62,6 +62,8 @@ class Alternative:
     effect: str
     place: Place
     probability: float
+    seat: Place | None = None
+    """Where it shows, if that is not its place: the joint that moves a link."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class Finding:
     """Drop of chi-squared that it alone is worth."""
     size: float = np.inf
     """Of its largest magnitude, in what is typical of its kind; infinite of what has no kind."""
+    seat: Place | None = None
+    """As of an alternative."""
 
     @property
     def of_class(self) -> float:
@@ -160,6 +164,7 @@ def findings(
                 law=EQUATIONS[hypothesis.effect],
                 gain=gain,
                 size=final.size(hypothesis),
+                seat=hypothesis.seat,
             )
         )
     return in_order(shared(told))
@@ -177,13 +182,13 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
         known = {e.effect for e in finding.equivalents}
         others = [f for f in kin if f is not finding and f.effect not in known]
         share = finding.probability / (1 + len(others))
-        more = tuple(Alternative(f.effect, f.place, share) for f in others)
+        more = tuple(Alternative(f.effect, f.place, share, f.seat) for f in others)
         told.append(replace(finding, probability=share, equivalents=more + finding.equivalents))
     return told
 
 
 def _cause(finding: Finding | Alternative) -> tuple[object, Place]:
-    return CLASS_OF.get(finding.effect, finding), finding.place
+    return CLASS_OF.get(finding.effect, finding), finding.seat or finding.place
 
 
 def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -191,15 +196,21 @@ def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
 
     Beside an effect of a usual size, those of which every robot has a little come after, though
     more of the error is theirs (a clock that is off by a little moves everything), unless nearly
-    all of it is.
+    all of it is. What has no name is first only where it is surer than the first that has one: a
+    torque that may be anything explains the most.
     """
-    usual = [f for f in found if f.effect != "unknown" and f.believed and f.size >= SLIGHT]
+    usual = [f for f in found if f.effect != NAMELESS and f.believed and f.size >= SLIGHT]
     most = max((f.gain for f in usual), default=np.inf)
 
     def slight(finding: Finding) -> bool:
         return bool(usual) and finding.size < SLIGHT and finding.gain < DOMINANT * most
 
-    return tuple(sorted(found, key=lambda f: (slight(f), -f.gain)))
+    ordered = sorted(found, key=lambda f: (slight(f), -f.gain))
+    named = next((f for f in ordered if f.effect != NAMELESS), None)
+    if named and named.probability >= ordered[0].probability and ordered[0].effect == NAMELESS:
+        ordered.remove(named)
+        ordered.insert(0, named)
+    return tuple(ordered)
 
 
 def reaches(model: Model) -> Array:
@@ -222,7 +233,9 @@ def _rivals(
     twins = twins_of(hypothesis, by_key, chosen)
     share = own / (1 + len(twins))
     by_key |= dict.fromkeys(twins, share)
-    told = [Alternative(*key, p) for key, p in by_key.items() if p >= WORTH_SAYING]
+    known_of = [*(m.hypotheses[-1] for m in models), *(s.trace.hypothesis for s in chosen.ranking)]
+    seats = {h.key: h.seat for h in known_of}
+    told = [Alternative(*key, p, seats[key]) for key, p in by_key.items() if p >= WORTH_SAYING]
     return share, tuple(sorted(told, key=lambda a: -a.probability))
 
 
