@@ -147,6 +147,17 @@ class TestSettled:
         assert model.hypotheses == (LAST, RIVAL)
         assert [m.hypotheses[-1] for m in rounds[2].finalists] == [RIVAL, FIRST]
 
+    def test_forms_of_its_class_are_compared_however_far_behind_they_were(self) -> None:
+        """A drag that hides had made friction that rises at rest of dry friction."""
+        form = replace(FIRST, effect="presliding_hysteresis")
+        assert form.sibling_of(FIRST) and not RIVAL.sibling_of(FIRST)
+        far = (made((FIRST,), 700.0), made((form,), 950.0), made((RIVAL,), 950.0))
+        rounds = (chosen(made((), 1000.0), *far), self.rounds[1])
+        selector = Made({(LAST, form): 380.0, (LAST, RIVAL): 300.0, (LAST,): 900.0})
+        model, told = selector.settled(self.found, rounds)
+        assert model.hypotheses == (LAST, form)
+        assert [m.hypotheses[-1] for m in told[2].finalists] == [form, FIRST]
+
     def test_what_was_found_beside_all_others_is_not_compared_again(self) -> None:
         model = made((LAST,), 400.0)
         rounds = [chosen(made((), 1000.0), model, made((RIVAL,), 402.0))]

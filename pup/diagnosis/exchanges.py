@@ -160,12 +160,15 @@ class Exchanger(Selector):
     def _likely(
         self, chosen: Round, known: Collection[tuple[str, Place]]
     ) -> list[tuple[Hypothesis, Fit]]:
-        """What else a round may have found, the likeliest, each as it was fitted there."""
+        """What else a round may have found, the likeliest, each as it was fitted there.
+
+        Forms of the class that was found are told apart by little, which others easily hide.
+        """
         models = chosen.finalists[: chosen.holding]
         chances = probabilities(models, chosen.before, self.noise)
         ranked = sorted(zip(chances, models, strict=True), key=lambda pair: -pair[0])
-        likely = [m for chance, m in ranked if chance > LIKELY]
-        rivals = [(m.hypotheses[-1], m.fit) for m in likely]
+        tried = [(chance, m.hypotheses[-1], m.fit) for chance, m in ranked]
+        rivals = [(h, f) for p, h, f in tried if p > LIKELY or h.sibling_of(chosen.chosen)]
         return [(h, fit) for h, fit in rivals if h.key not in known][:ASKED]
 
 
