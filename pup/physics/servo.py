@@ -13,6 +13,7 @@ from pup.physics import kernels
 from pup.physics.commands import HeldCommands, Target
 from pup.physics.limited import LimitedLaw
 from pup.physics.outfit import Outfit
+from pup.physics.terms import Drivetrain
 from pup.physics.terms.base import Drive, Flow, Outcome, Term
 
 Array = NDArray[np.float64]
@@ -57,6 +58,7 @@ class Servos:
         self.partly = None if self.power is None else self._partly(self.power)
         self.erring, self.driving, self.settling = of("error"), of("drive"), of("settle")
         self.flowing = of("flow")
+        self.train = next((t for t in outfit.terms if isinstance(t, Drivetrain)), None)
         self.before: Array | None = None
         self.needs_law_damping = any(term.needs_law_damping for term in self.flowing)
 
@@ -116,7 +118,8 @@ class Servos:
             before = now if self.before is None else self.before[: len(now)]
             self.before = now.copy()
             coming = 2 * now - before
-            flow = Flow(time, *link, now, coming, own, torque, damping, brake, viscous)
+            angle = link[0] if self.train is None else self.train.turned(link[0])
+            flow = Flow(time, *link, angle, now, coming, own, torque, damping, brake, viscous)
             for term in self.flowing:
                 term.flow(flow)
         return torque - brake, damping + viscous

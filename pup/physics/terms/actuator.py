@@ -349,6 +349,6 @@ class Cogging(Term):
     def flow(self, flow: Flow) -> None:
         """See Term."""
         n = len(flow.torque)
-        turn = self.values["teeth"][:n] * flow.position
+        turn = self.values["teeth"][:n] * flow.angle
         flow.torque += self.values["sine"][:n] * np.sin(turn)
         flow.torque += self.values["cosine"][:n] * np.cos(turn)

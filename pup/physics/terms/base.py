@@ -126,6 +126,7 @@ class Flow:
         simulation's own, shape (n_active, 1).
       position: of the link, rad.
       link: its velocity, rad/s.
+      angle: of what the torque moves, rad.
       velocity: of what the torque moves, rad/s.
       coming: what it will be at the sub-step's end if it goes on as it did, rad/s.
       law_damping: the servo's damping off its torque limit, N m s/rad; only where a term asks.
@@ -133,13 +134,12 @@ class Flow:
       damping: applied times the velocity at the sub-step's end, N m s/rad.
       brake: against the torque, by damping outside the servo, N m.
       viscous: the part of that damping applied times the velocity at the end, N m s/rad.
-      motor: torque of motors of their own and against the joints' damping, N m; NaN where a link
-        has none, None where no link has.
     """
 
     time: float | Array
     position: Array
     link: Array
+    angle: Array
     velocity: Array
     coming: Array
     law_damping: Array | None
@@ -147,7 +147,6 @@ class Flow:
     damping: Array
     brake: Array
     viscous: Array
-    motor: Array | None = None
 
     def carried(self) -> Array:
         """The torque that is applied, N m: damping is, by the velocity at the end."""

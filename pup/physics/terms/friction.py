@@ -171,10 +171,7 @@ class LoadDependentFriction(Friction):
         n, motor = len(flow.torque), flow.carried()
         acceleration = (flow.coming - flow.velocity) / self.scene.timestep
         passed = motor - self.scene.armature[:n] * acceleration
-        load = motor + passed
-        if flow.motor is not None:  # what has come through play or give is what was passed on
-            load = np.where(np.isnan(flow.motor), load, flow.motor + flow.carried())
-        return np.asarray(self.values["share"][:n] * np.abs(load))
+        return np.asarray(self.values["share"][:n] * np.abs(motor + passed))
 
 
 class GearEfficiency(Friction):

@@ -57,7 +57,8 @@ class Drivetrain(Term):
     Motor and link are two masses. The motor's step is solved together with the link's: seen from
     the link, the rest is a torque and a viscous coefficient, whatever the stiffness between them,
     and as play and give go to nothing the rotor's inertia goes back to the link. The servo's and
-    the joint's damping act on the motor.
+    the joint's damping act on the motor, and so do friction and cogging, which are the motor's and
+    its gear's: what is loose rattles freely.
 
     Args:
       parts: the play and the give.
@@ -135,6 +136,15 @@ class Drivetrain(Term):
         )
         return told, felt
 
+    def turned(self, position: Array) -> Array:
+        """Angles of what servos turn, their motors or else their links, (n_active, n_joints), rad.
+
+        Args:
+          position: of the links, same shape, rad.
+        """
+        n = len(position)
+        return np.where(self._active[:n], self._position[:n], position)
+
     def bend(self, torque: Array) -> Array:
         """Let motors start where they have long passed on a torque.
 
@@ -167,11 +177,9 @@ class Drivetrain(Term):
         """See Term: what has acted on the motor, acts on the link from here on."""
         n, before = len(flow.torque), self._before[: len(flow.torque)]
         # Without a motor of its own, what turns a link bears the joint's damping, too.
-        driven = flow.carried() + flow.brake + flow.viscous * flow.coming
-        flow.motor = np.where(self._active[:n], driven, np.nan)
-        self.driven[:n] = driven
+        self.driven[:n] = flow.carried() + flow.brake + flow.viscous * flow.coming
         begin(before, flow.link)
-        flow.velocity, flow.coming = flow.link, 2 * flow.link - before
+        flow.angle, flow.velocity, flow.coming = flow.position, flow.link, 2 * flow.link - before
         before[:] = flow.link
         kernels.engage(
             flow.torque,
