@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pup.diagnosis import exchanges, retracing, selection
+from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.evidence import Projector, Trace
 from pup.diagnosis.exchanges import Exchanger
 from pup.diagnosis.fit import Fit
@@ -349,3 +350,24 @@ def test_where_all_that_was_tried_leaves_many_times_the_noise_more_are_tried(
     first = {known[-1] for known, _ in tried}
     rest = [s.trace.hypothesis for s in ranking[:FURTHER] if s.trace.hypothesis not in first]
     assert set(more) == (set(rest) if looked else set())
+
+
+@pytest.mark.parametrize(("seconds", "told"), [(0.02, False), (0.1, True), (3.0, False)])
+def test_a_law_that_ends_where_it_does_as_another_is_not_that_law(
+    seconds: float, told: bool
+) -> None:
+    """Friction that has risen at once is lower the faster, no more: Stribeck's, in another form."""
+    base = next(h for h in hypotheses(MAKER.measured) if h.effect == "rising_static_friction")
+    time = term_coordinate(base.telling[0], MAKER.scale)
+
+    def model(known: Hypothesis | None, error: float) -> Model:
+        made = MAKER.model(known, error)
+        if known is None:
+            return made
+        at = np.r_[made.fit.at, time.coordinate(seconds)]
+        fit = replace(made.fit, coordinates=(*made.fit.coordinates, time), at=at)
+        return replace(made, fit=fit)
+
+    selector = Made({})
+    selector.followed = None
+    assert Exchanger.holds(selector, model(None, 3.0), model(base, 1.0)) is told

@@ -1,6 +1,6 @@
 """A least-squares fit: where it stands, and what its Jacobian promises."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +15,8 @@ WIDE = 50.0
 ENOUGH = 0.2
 """A fit has ended when no step lowers chi-squared by as much."""
 ALMOST = 1e-9
+NEAR = 0.05
+"""Coordinates so near an end of their range count as there: a twentieth of what is positive."""
 
 
 @dataclass
@@ -107,6 +109,14 @@ class Fit:
         above = self.at > np.array([c.upper for c in self.coordinates]) - ALMOST
         below = self.at < np.array([c.lower for c in self.coordinates]) + ALMOST
         return ~(above & (downhill > 0) | below & (downhill < 0))
+
+    def at_an_end(self, names: Collection[str]) -> bool:
+        """Whether any of some coordinates is at an end of its range."""
+        return any(
+            min(at - c.lower, c.upper - at) < NEAR
+            for c, at in zip(self.coordinates, self.at, strict=True)
+            if c.name in names
+        )
 
     def covariance(self) -> Array:
         """Of the coordinates, shape (n_free, n_free); what the data do not see has its range."""

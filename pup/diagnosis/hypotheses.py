@@ -109,6 +109,11 @@ class Hypothesis:
         """Values of the other shapes, which no refit moves."""
         return tuple(value for name, value in self.shape if name not in self.continuous)
 
+    @property
+    def telling(self) -> tuple[str, ...]:
+        """Columns of shapes that tell it from other forms of its class."""
+        return tuple(column(self.effect, n, self.place) for n in TERMS[self.effect].telling)
+
     def row(self, sizes: Mapping[str, float] | None = None) -> dict[str, float]:
         """The term's columns, at given magnitudes or at moderate ones."""
         given = sizes or {

@@ -305,6 +305,8 @@ class Selector:
         if not (self._beyond_forms(before, after) or self._completes(before, after)):
             return False
         newest, known = after.hypotheses[-1], _effects(before.hypotheses)
+        if after.fit.at_an_end(newest.telling):
+            return False
         both, measured = (before.fit, after.fit), self.replays.measured
         return explains(newest, *both, measured, newest.effect in known) and material(
             newest, *both, measured

@@ -186,6 +186,8 @@ class Term:
         where slopes lead: what bounces has one at many a stiffness.
       one_way: whether a negative size is no opposite of a positive one, as a brake of one direction
         is none of the other's.
+      telling: shapes that tell it from other forms of its class: at an end of their range it does
+        as one of those does.
       needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
@@ -203,6 +205,7 @@ class Term:
     constant: ClassVar[bool] = False
     starts: ClassVar[tuple[float, ...]] = ()
     one_way: ClassVar[bool] = False
+    telling: ClassVar[tuple[str, ...]] = ()
     needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 

@@ -102,16 +102,18 @@ class RisingStaticFriction(Friction):
 
     The rise with the time at rest is that of the seven-parameter model (Armstrong-Helouvry, Dupont
     and Canudas de Wit 1994, table 3); the time is forgotten over a slip, as the state of Dieterich
-    and Ruina is. At a constant speed it is lower the faster, as Stribeck friction is.
+    and Ruina is. At a constant speed it is lower the faster, as Stribeck friction is, and with next
+    to no time of its own it is a form of that; with very much it grows throughout a recording.
     """
 
     effect = "rising_static_friction"
     quantities = (
         Quantity("torque", "N m", 0.05, 1.0),
         Quantity("rise", "N m", 0.06, 1.0),
-        Quantity("time", "s", 0.1, 10.0, grid=(0.03, 0.3)),
+        Quantity("time", "s", 0.1, 3.0, grid=(0.06, 0.3)),
         Quantity("slip", "rad", 0.03, 0.3, grid=(0.01, 0.05)),
     )
+    telling = ("time",)
     source = "sizes as of Stribeck friction; time 0 to 200 s (Armstrong-Helouvry et al. 1994)"
     state = ("_bend", "_age")
 
