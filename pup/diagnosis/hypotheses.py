@@ -13,6 +13,7 @@ from pup.diagnosis.residuals import Measured
 from pup.physics.model import compile_model
 from pup.physics.terms import CLASS_OF, TERMS, Place, Quantity, column
 from pup.physics.terms.scale import Scale
+from pup.robot import RobotDescription
 
 MODERATE = 0.5
 """A hypothesis is first looked at in this share of its typical size."""
@@ -137,11 +138,12 @@ def hypotheses(measured: Measured) -> list[Hypothesis]:
     """All hypotheses about some measurements, but for what the robot's description has already."""
     scale = Scale.of(measured.robot)
     known = {(term.effect, Place(term.kind, term.name)) for term in measured.robot.terms}
-    movers = _movers(measured)
+    model = _compiled(measured)
+    movers = _movers(measured.robot, model)
     return [
         Hypothesis(effect, place, scale, shape, sign, movers.get(place, ""))
         for effect, term in TERMS.items()
-        for place in _places(effect, measured)
+        for place in _places(effect, measured, model)
         if (effect, place) not in known
         for shape in _shapes(effect, place, measured, scale)
         for sign in ((1.0, -1.0) if term.one_way else (1.0,))
@@ -181,7 +183,7 @@ def _stops(place: Place, measured: Measured) -> Iterator[tuple[tuple[str, float]
         yield angle, (column("joint_stop", "side", place), side)
 
 
-def _places(effect: str, measured: Measured) -> Iterator[Place]:
+def _places(effect: str, measured: Measured, model: mujoco.MjModel) -> Iterator[Place]:
     """Places where an effect would show."""
     robot, kinds = measured.robot, TERMS[effect].kinds
     ground = any(r.support == "ground" for r in measured.recordings)
@@ -200,7 +202,7 @@ def _places(effect: str, measured: Measured) -> Iterator[Place]:
                 if 1 < n < whole
             )
         elif kind == "body":
-            yield from _bodies(effect, measured, ground)
+            yield from _bodies(effect, measured, model)
         elif kind in ("ground", "sensor", "foot") and ground:
             names = robot.feet if kind == "foot" else ("",)
             yield from (Place(kind, name) for name in names)
@@ -215,10 +217,9 @@ def _compiled(measured: Measured) -> mujoco.MjModel:
     return compile_model(measured.robot, support).compiled
 
 
-def _movers(measured: Measured) -> dict[Place, str]:
+def _movers(robot: RobotDescription, model: mujoco.MjModel) -> dict[Place, str]:
     """Of each link that a joint of the robot moves, that joint: the nearest one above it."""
-    model = _compiled(measured)
-    moved = {int(model.joint(name).bodyid[0]): name for name in measured.robot.joint_names}
+    moved = {int(model.joint(name).bodyid[0]): name for name in robot.joint_names}
     nearest: dict[int, str] = {}
     for body in range(1, model.nbody):  # parents come before their children
         joint = moved.get(body) or nearest.get(int(model.body_parentid[body]))
@@ -227,11 +228,10 @@ def _movers(measured: Measured) -> dict[Place, str]:
     return {Place("body", model.body(body).name): joint for body, joint in nearest.items()}
 
 
-def _bodies(effect: str, measured: Measured, ground: bool) -> Iterator[Place]:
+def _bodies(effect: str, measured: Measured, model: mujoco.MjModel) -> Iterator[Place]:
     """Bodies whose motion the data can show: links that joints move, and a free torso."""
     robot = measured.robot
     supports = {r.support for r in measured.recordings}
-    model = _compiled(measured)
     carried = [int(model.joint(name).bodyid[0]) for name in robot.joint_names]
     if effect == "structural_flex":
         yield from (Place("body", model.body(b).name) for b in dict.fromkeys(carried))
@@ -240,7 +240,7 @@ def _bodies(effect: str, measured: Measured, ground: bool) -> Iterator[Place]:
     least = 2 if outside else 1
     for body in range(1, model.nbody):
         joints = sum(_is_below(model.body_parentid, body, c) for c in carried)
-        free = ground and model.body(body).name == robot.torso
+        free = "ground" in supports and model.body(body).name == robot.torso
         held = joints >= least and not (outside and supports == {"ground"})
         if (held or free) and model.body_mass[body] > 0.01:
             yield Place("body", model.body(body).name)
