@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from pup.blind.catalogue import CLASS_OF, CLASSES, KINDS, available, draw, unlisted
+from pup.blind.drafts import draw_case
 from pup.blind.kit import Kit
 from pup.blind.reference import readings
+from pup.blind.setting import Setting
 from pup.blind.world import Effect, Nominal, Plan, World
+from pup.errors import InputError
 from pup.robot import RobotDescription
 
 SEEN = 2e-5  # rad, rms; a tenth of it would be lost in the noise of any set
@@ -107,6 +110,23 @@ def test_a_delayed_command_and_a_delayed_reading_cannot_be_told_apart() -> None:
     one, two = (readings(replace(world, effects=(e,)), moves)[0] for e in (command, reading))
     for name in one:
         assert np.abs(one[name].position - two[name].position).max() < 2e-4
+
+
+def test_a_weight_is_missing_where_loads_that_are_known_differ() -> None:
+    """With one load, more weight is the same as less of all that the servo does."""
+    robot = RobotDescription.load("servo_bench")
+    loads = {True: [0], False: [0]}
+    for seed in range(400):
+        rng, plain = np.random.default_rng(seed), seed % 2 == 0
+        try:
+            draft = draw_case(robot, "pair", False, rng, Setting(plain=plain))
+        except InputError:
+            continue
+        if "payload" in [effect.name for effect in draft.effects]:
+            loads[plain].append(len({plan.setup["mass"] for plan in draft.plans if not plan.test}))
+    assert loads[True] == [0]
+    assert len(loads[False]) > 3
+    assert min(loads[False][1:]) > 1
 
 
 @pytest.mark.parametrize("share", [1.0, 0.1])

@@ -11,7 +11,7 @@ from pup.blind.absorb import visibility
 from pup.blind.reference import Reference, readings
 from pup.blind.refit import Refit
 from pup.blind.sensors import Noise
-from pup.blind.world import Nominal, World
+from pup.blind.world import Effect, Nominal, Place, World
 
 NOISE, QUIET = Noise(), Noise(position=1e-4, quantum=0.0)
 ROUNDS = 4
@@ -60,6 +60,23 @@ def test_a_torque_limit_below_what_motions_meet_is_found(monkeypatch: pytest.Mon
     assert found.values["tau_max/servo"] == pytest.approx(wanted["tau_max/servo"], rel=0.01)
     monkeypatch.setattr(module, "_limits", lambda origin: [dict(origin.values)])
     assert refit.best(ROUNDS).off > 10
+
+
+def test_more_weight_is_the_same_as_a_weaker_servo() -> None:
+    """What slopes promise at first leads elsewhere."""
+    world, values = known("servo_bench")
+    shown = plans(world.robot, "bench")
+    heavy = Effect("payload", Place("body", ("load",)), 0.06, "mass", "kg")
+    seen = readings(replace(world, effects=(heavy,)), shown)[0]
+    refit = Refit(
+        Reference.of(world, shown, values), {n: one.stacked() for n, one in seen.items()}, NOISE
+    )
+    found = refit.best(ROUNDS)
+    assert refit.begun().off > 50
+    assert found.off < 3.0
+    weaker = 0.3247 / (0.3247 + heavy.size)
+    for name in ("kp/servo", "tau_max/servo"):
+        assert found.values[name] == pytest.approx(weaker * values[name], rel=0.05)
 
 
 def test_a_refit_never_leaves_more_than_none() -> None:

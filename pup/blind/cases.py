@@ -18,7 +18,7 @@ from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import RobotDescription
 
-ROUNDS = 2  # steps of a refit that is measured
+ROUNDS = 5  # steps of a refit that is measured
 REDRAWS, TUNINGS, CALMINGS = 30, 4, 2
 STRICT = 12  # redraws in which a case must turn out to be of the stratum that it is drawn for
 VERDICTS = ("mismatch", "none", "undetermined")
@@ -170,7 +170,7 @@ def _each(draft: Draft, reference: Reference) -> list[Visibility]:
     views = []
     for effect in draft.effects:
         seen = readings(replace(draft.world, effects=(effect,)), reference.plans)[0]
-        views.append(visibility(reference, seen, draft.noise))
+        views.append(visibility(reference, seen, draft.noise, rounds=ROUNDS))
     return views
 
 

@@ -1,7 +1,8 @@
 """The refit of the nominal parameters that hides most of an effect.
 
 Gauss and Newton's steps from several starts, each judged by what is simulated there. A torque limit
-that no motion meets has no slope: what lies below it is found by starting there.
+that no motion meets has no slope: what lies below it is found by starting there. More weight on a
+joint is the same as less of all else, which slopes lead to only from near by.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +20,7 @@ FURTHEST = (-0.9, 4.0)  # relative changes of parameters in a refit
 STRIDES = (0.5, 0.15, 0.04)  # largest relative changes in one step, tried at once
 PULL = 1.0  # sigma that a parameter's change by its own size must gain, lest it drifts
 LIMITS = (0.8, 0.5)  # of the torque from which motions are limited: where else to start
+SCALES = (0.65, 0.8, 0.9, 1.25)  # of all parameters at once: where else to start
 TINY = 1e-9  # way between bounds that meet
 SETTLED = 0.04  # share of what is left squared, that another step must promise to be worth it
 FAINTEST = 1.0  # sigma squared, that it must promise besides
@@ -96,11 +98,14 @@ class Refit:
         if not rounds or begun.off**2 <= FAINTEST:
             return begun
         steps, limits = _stepped(begun), _limits(self.origin)
-        fits = self._tried([*steps, *limits], begun.slopes)
+        fits = self._tried([*steps, *limits, *_scaled(self.origin)], begun.slopes)
         ends = [self._descended(_nearest([begun, *fits[: len(steps)]]), rounds - 1)]
-        other = min(fits[len(steps) :], key=lambda fit: fit.left)
-        if other.left < PROMISE * ends[0].off:
-            ends.append(self._descended(self._sharpened(other), rounds))
+        limited, scaled = fits[len(steps) : -len(SCALES)], _nearest(fits[-len(SCALES) :])
+        promising = min(limited, key=lambda fit: fit.left)
+        if promising.left < PROMISE * ends[0].off:
+            ends.append(self._descended(self._sharpened(promising), rounds))
+        if scaled.off < begun.off:
+            ends.append(self._descended(self._sharpened(scaled), rounds))
         return _nearest(ends)
 
     def missed(self, fit: Fit, plans: Sequence[Plan]) -> Array:
@@ -228,3 +233,8 @@ def _limits(origin: Reference) -> list[dict[str, float]]:
             lower = max(part * float(binding), 1 + FURTHEST[0])
             found.append({**origin.values, name: origin.values[name] * lower})
     return found
+
+
+def _scaled(origin: Reference) -> list[dict[str, float]]:
+    """All parameters so many times as large."""
+    return [{name: scale * v for name, v in origin.values.items()} for scale in SCALES]
