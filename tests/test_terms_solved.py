@@ -104,7 +104,7 @@ def sprung(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
 
 def stopped(t: float, x: Array, target: float) -> tuple[float, Sequence[float]]:
     q, v = x
-    push = max(20 * (q - 0.05 + RELAXATION * v), 0) if q > 0.05 else 0.0
+    push = max(20 * (q - 0.05 + (RELAXATION + 0.01) * v), 0) if q > 0.05 else 0.0
     return servo(target - q, v) + weight(q) - push, ()
 
 
@@ -234,7 +234,7 @@ CASES: dict[str, tuple[Row, Law, Sequence[float], float, float]] = {
     "dead_band": ({"width": 0.01}, dead, (), INERTIA, 1e-4),
     "cogging": ({"sine": 0.03, "cosine": 0.02, "teeth": 24.0}, rippling, (), INERTIA, 1e-4),
     "joint_spring": ({"stiffness": 0.4, "preload": 0.1}, sprung, (), INERTIA, 1e-4),
-    "joint_stop": ({"stiffness": 20.0, "angle": 0.05}, stopped, (), INERTIA, 1e-4),
+    "joint_stop": ({"stiffness": 20.0, "angle": 0.05, "loss": 0.01}, stopped, (), INERTIA, 1e-4),
     "coulomb_friction": ({"torque": 0.08}, coulomb, (0.0,), INERTIA, 2e-4),
     "stribeck_friction": (
         {"torque": 0.05, "rest": 0.06, "speed": 0.5},

@@ -19,6 +19,7 @@ from terms import (
 from test_simulator import recording
 
 from pup.physics.terms import Place
+from pup.physics.terms.transmission import RELAXATION
 
 
 @pytest.mark.parametrize("angle", [0.5, -0.5])
@@ -105,3 +106,22 @@ def test_more_rotor_swings_slower_and_a_stop_stops() -> None:
     crossing = time[downward] + STEP * swing[downward] / (swing[downward] - swing[downward + 1])
     assert np.diff(crossing) == pytest.approx(period, rel=3e-4)
     assert -0.026 < stop.min() < -0.02
+
+
+@pytest.mark.parametrize("loss", [0.001, 0.003, 0.01])
+def test_what_a_stop_gives_back_of_the_speed_falls_with_its_loss(loss: float) -> None:
+    """As of a damped spring that never pulls, which is left before it has sprung back."""
+    time = np.arange(600) * STEP
+    off = {"torque_enabled": np.zeros(len(time))}
+    run = recording(BENCH, time, np.zeros(len(time)), 0.3, extras=off)
+    there, k = Place("joint", "servo"), 30.0
+    (swing,) = bench(
+        run, sizes("joint_stop", there, stiffness=k, angle=-0.02, side=-1.0, loss=loss)
+    )
+    speed = np.diff(swing) / STEP
+    struck = int(np.argmin(speed))
+    kept = float(speed[struck : struck + 60].max()) / -speed[struck]
+    share = (loss + RELAXATION) * np.sqrt(k / INERTIA) / 2  # of critical damping
+    rest = np.sqrt(1 - share**2)
+    left = np.exp(-share / rest * np.arctan2(2 * share * rest, 2 * share**2 - 1))
+    assert kept == pytest.approx(left, abs=0.03)

@@ -178,9 +178,10 @@ def _stops(place: Place, measured: Measured) -> Iterator[tuple[tuple[str, float]
     visited = measured.values[measured.channel == joint]
     if not len(visited):
         return
+    loss = next(q.nominal for q in TERMS["joint_stop"].quantities if q.name == "loss")
     for side, quantile in ((-1.0, 0.03), (1.0, 0.97)):
-        angle = column("joint_stop", "angle", place), float(np.quantile(visited, quantile))
-        yield angle, (column("joint_stop", "side", place), side)
+        told = {"angle": float(np.quantile(visited, quantile)), "side": side, "loss": loss}
+        yield tuple((column("joint_stop", name, place), value) for name, value in told.items())
 
 
 def _places(effect: str, measured: Measured, model: mujoco.MjModel) -> Iterator[Place]:

@@ -35,7 +35,7 @@ EQUATIONS = {
     "payload": "mass + m",
     "armature": "rotor inertia + J",
     "joint_spring": "tau += p - k q",
-    "joint_stop": "tau -= k (q - a) beyond a",
+    "joint_stop": "tau -= k (q - a + T dq) beyond a, never pulling",
     "clock_skew": "target(t) = command(t (1 + s))",
     "ground_compliance": "contact time constant + t",
     "ground_slope": "gravity turned by (roll, pitch)",
