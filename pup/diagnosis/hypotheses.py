@@ -110,6 +110,12 @@ class Hypothesis:
         """Values of the other shapes, which no refit moves."""
         return tuple(value for name, value in self.shape if name not in self.continuous)
 
+    @cached_property
+    def least(self) -> dict[str, float]:
+        """Magnitudes below which it is another thing, whatever it explains, in their units."""
+        share = TERMS[self.effect].least
+        return {n: share * t for n, t in zip(self.magnitudes, self.typical, strict=True)}
+
     @property
     def telling(self) -> tuple[str, ...]:
         """Columns of shapes that tell it from other forms of its class."""

@@ -305,6 +305,9 @@ class Selector:
         if not (self._beyond_forms(before, after) or self._completes(before, after)):
             return False
         newest, known = after.hypotheses[-1], _effects(before.hypotheses)
+        values = after.fit.values
+        if any(abs(values[name]) < least for name, least in newest.least.items()):
+            return False
         if after.fit.at_an_end(newest.telling):
             return False
         both, measured = (before.fit, after.fit), self.replays.measured

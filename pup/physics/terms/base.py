@@ -188,6 +188,8 @@ class Term:
         is none of the other's.
       telling: shapes that tell it from other forms of its class: at an end of their range it does
         as one of those does.
+      least: share of its typical size below which it is another thing, whatever it explains: what
+        gives way as a spring does is no stop.
       needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
@@ -206,6 +208,7 @@ class Term:
     starts: ClassVar[tuple[float, ...]] = ()
     one_way: ClassVar[bool] = False
     telling: ClassVar[tuple[str, ...]] = ()
+    least: ClassVar[float] = 0.0
     needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 

@@ -265,6 +265,7 @@ class JointStop(Term):
     effect = "joint_stop"
     kinds = ("joint",)
     starts = (1.0, 5.0, 25.0)
+    least = 0.25
     quantities = (
         Quantity("stiffness", "N m/rad", 20.0, 2000.0),
         Quantity("angle", "rad", 0.0, 3.2, signed=True, grid=(-1.0, 1.0)),
