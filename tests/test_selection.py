@@ -352,22 +352,30 @@ def test_where_all_that_was_tried_leaves_many_times_the_noise_more_are_tried(
     assert set(more) == (set(rest) if looked else set())
 
 
+def ended_at(known: Hypothesis, name: str, value: float) -> tuple[Model, Model]:
+    """A model of an effect whose fit has come to some value of a column, after one without it."""
+    coordinate, bare = term_coordinate(name, MAKER.scale), MAKER.model(None, 3.0)
+    found = MAKER.model(known, 1.0)
+    at = np.r_[found.fit.at, coordinate.coordinate(value)]
+    fit = replace(found.fit, coordinates=(*found.fit.coordinates, coordinate), at=at)
+    return bare, replace(found, fit=fit)
+
+
 @pytest.mark.parametrize(("seconds", "told"), [(0.02, False), (0.1, True), (3.0, False)])
 def test_a_law_that_ends_where_it_does_as_another_is_not_that_law(
     seconds: float, told: bool
 ) -> None:
     """Friction that has risen at once is lower the faster, no more: Stribeck's, in another form."""
     base = next(h for h in hypotheses(MAKER.measured) if h.effect == "rising_static_friction")
-    time = term_coordinate(base.telling[0], MAKER.scale)
-
-    def model(known: Hypothesis | None, error: float) -> Model:
-        made = MAKER.model(known, error)
-        if known is None:
-            return made
-        at = np.r_[made.fit.at, time.coordinate(seconds)]
-        fit = replace(made.fit, coordinates=(*made.fit.coordinates, time), at=at)
-        return replace(made, fit=fit)
-
     selector = Made({})
     selector.followed = None
-    assert Exchanger.holds(selector, model(None, 3.0), model(base, 1.0)) is told
+    assert Exchanger.holds(selector, *ended_at(base, base.telling[0], seconds)) is told
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.1, False), (0.5, True)])
+def test_what_gives_way_as_a_spring_does_is_no_stop(share: float, told: bool) -> None:
+    base = next(h for h in hypotheses(MAKER.measured) if h.effect == "joint_stop")
+    selector = Made({})
+    selector.followed = None
+    models = ended_at(base, base.magnitudes[0], share * base.typical[0])
+    assert Exchanger.holds(selector, *models) is told
