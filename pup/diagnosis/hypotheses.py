@@ -128,10 +128,10 @@ class Hypothesis:
         }
         return {**dict(self.shape), **given}
 
-    def probes(self) -> list[dict[str, float]]:
-        """One row for each magnitude alone, at a moderate size."""
+    def probes(self, share: float = 1.0) -> list[dict[str, float]]:
+        """One row for each magnitude alone, at a share of its moderate size."""
         return [
-            self.row({name: self.moderate * typical})
+            self.row({name: share * self.moderate * typical})
             for name, typical in zip(self.magnitudes, self.typical, strict=True)
         ]
 

@@ -1,6 +1,7 @@
 """What each hypothesis changes in the samples, with as few simulations as can tell it.
 
-A hypothesis is simulated once, at a moderate size. While the torso is fixed, joints are simulated
+A hypothesis is simulated once, at a moderate size; of a single joint, where simulations cost
+little, at a small one too. While the torso is fixed, joints are simulated
 one by one, limbs sharing simulations, and what several joints change together is the sum of what
 each does. On the ground everything moves everything and a simulation costs five times as much:
 there joints are first simulated together, and one by one only where they look, together, like the
@@ -26,6 +27,9 @@ Array = NDArray[np.float64]
 PROMISING = 12
 """Effects at several joints each, whatever their forms, whose joints are simulated one by one on
 the ground too."""
+SMALL = 0.1
+"""Share of the moderate size at which hypotheses of a single joint are looked at again: where a
+motion hangs by a hair, what much of an effect changes says nothing of what little of it does."""
 
 
 def traces(
@@ -66,8 +70,18 @@ def traces(
         close = dict.fromkeys(m for h in together if h.key in leading for m in together[h])
         for h, whole in simulated(close, ground).items():
             wholes[h] = wholes[h] + whole
-    told = (traced(h, wholes[h], project) for h in hypotheses)
+    told = [traced(h, wholes[h], project) for h in hypotheses]
+    if len(replays.measured.robot.joints) == 1:
+        small = _simulated(hypotheses, fixed, base, replays, noise, SMALL)
+        again = [traced(h, small[h], project) for h in hypotheses]
+        told = [_likelier(pair, base.residual) for pair in zip(told, again, strict=True)]
     return [trace for trace in told if trace is not None]
+
+
+def _likelier(told: Iterable[Trace | None], residual: Array) -> Trace | None:
+    """The one of some traces of a hypothesis that looks most like the errors."""
+    seen = [trace for trace in told if trace is not None]
+    return scores(seen, residual)[0].trace if seen else None
 
 
 def by_rank(
@@ -106,14 +120,15 @@ def _simulated(
     base: Fit,
     replays: Replays,
     noise: Noise,
+    share: float = 1.0,
 ) -> dict[Hypothesis, Array]:
     """Whitened changes of some recordings' samples per typical size, (n_samples, n_magnitudes)."""
-    probes = [probe for h in hypotheses for probe in h.probes()]
+    probes = [probe for h in hypotheses for probe in h.probes(share)]
     changed = changes([(base.row(), probes, probes)], replays, recordings)[0]
     white = replays.measured.whiten(changed, noise)
     ends = np.cumsum([0, *(len(h.magnitudes) for h in hypotheses)])
     return {
-        h: white[a:b].T / h.moderate
+        h: white[a:b].T / (share * h.moderate)
         for h, a, b in zip(hypotheses, ends[:-1], ends[1:], strict=True)
     }
 
