@@ -1,5 +1,7 @@
 """Traces put together from few simulations against those of simulations of their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,12 +10,14 @@ from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.hypotheses import MODERATE, Hypothesis, hypotheses
 from pup.diagnosis.noise import assumed_noise
+from pup.diagnosis.probing import changes
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.tracing import by_rank, traces
+from pup.diagnosis.tracing import SMALL, by_rank, traces
 from pup.physics.parameters import robot_space
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
+from tests.diagnosis_cases import BENCH, recordings
 
 OP2 = RobotDescription.load("darwin_op2")
 SHIPPED = OP2.model_path.parent / "recordings"
@@ -79,6 +83,23 @@ def test_a_joint_that_was_not_simulated_is_as_promising_as_its_group(found: Foun
         later = groups[groups.index(above[0]) + 1 :] if above else []
         assert all(told.index(joint) < told.index(group) for group in later)
     assert {h.key for h in told} == set(claims)
+
+
+@pytest.mark.parametrize("share", [1.0, SMALL])
+def test_a_single_joint_is_looked_at_in_the_size_that_is_most_like_the_errors(share: float) -> None:
+    measured = Measured.of(BENCH, recordings({}))
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    noise = assumed_noise(measured)
+    coordinate = nominal_coordinate(replays.space, "kp/servo")
+    nominal = replays.space.nominal[replays.space.names.index("kp/servo")]
+    fit = Fit((coordinate,), np.array([coordinate.coordinate(nominal)]))
+    fit_together([fit], replays, noise, iterations=1)
+    known = next(h for h in hypotheses(measured) if h.effect == "backlash")
+    probes = known.probes(share)
+    changed = changes([(fit.row(), probes, probes)], replays)[0]
+    whole = measured.whiten(changed, noise)[0] / (share * MODERATE)
+    told = traces([known], replace(fit, residual=whole), replays, noise)[0]
+    assert told.whole[:, 0] == pytest.approx(whole, rel=1e-6, abs=1e-6)
 
 
 def _simulated(hypothesis: Hypothesis, base: Fit, replays: Replays) -> np.ndarray:
