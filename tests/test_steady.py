@@ -103,7 +103,7 @@ def test_a_rough_sensor_is_no_mismatch(rho: float) -> None:
 
 def test_errors_that_may_be_noise_are_to_be_told_from_it_by_repeats() -> None:
     """They drift, which no noise does by its looks, and no effect and no law foretells."""
-    told = rough(3, {"chirp": 0.004, "triangle": 0.004}, 0.95)
+    told = rough(0, {"chirp": 0.004, "triangle": 0.004}, 0.97)
     assert told.verdict == "undetermined"
     assert "nothing recorded twice" in told.reason
     assert told.ask is not None and "twice" in told.ask.words
