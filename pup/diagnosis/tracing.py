@@ -1,11 +1,10 @@
 """What each hypothesis changes in the samples, with as few simulations as can tell it.
 
 A hypothesis is simulated once, at a moderate size; of a single joint, where simulations cost
-little, at a small one too. While the torso is fixed, joints are simulated
-one by one, limbs sharing simulations, and what several joints change together is the sum of what
-each does. On the ground everything moves everything and a simulation costs five times as much:
-there joints are first simulated together, and one by one only where they look, together, like the
-errors.
+little, at a small one too. While the torso is fixed, joints are simulated one by one, limbs sharing
+simulations, and what several joints change together is the sum of what each does. On the ground
+everything moves everything and a simulation costs five times as much: there joints are first
+simulated together, and one by one only where they look, together, like the errors.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
