@@ -62,8 +62,8 @@ def test_a_torque_limit_below_what_motions_meet_is_found(monkeypatch: pytest.Mon
     assert refit.best(ROUNDS).off > 10
 
 
-def test_more_weight_is_the_same_as_a_weaker_servo() -> None:
-    """What slopes promise at first leads elsewhere."""
+def test_more_weight_is_the_same_as_a_weaker_servo(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What slopes promise at first leads elsewhere, and back only by more steps."""
     world, values = known("servo_bench")
     shown = plans(world.robot, "bench")
     heavy = Effect("payload", Place("body", ("load",)), 0.06, "mass", "kg")
@@ -77,6 +77,9 @@ def test_more_weight_is_the_same_as_a_weaker_servo() -> None:
     weaker = 0.3247 / (0.3247 + heavy.size)
     for name in ("kp/servo", "tau_max/servo"):
         assert found.values[name] == pytest.approx(weaker * values[name], rel=0.05)
+    assert refit.best(2).off < 1.0
+    monkeypatch.setattr(module, "_scaled", lambda origin: [dict(origin.values)] * 4)
+    assert refit.best(2).off > 5.0
 
 
 def test_a_refit_never_leaves_more_than_none() -> None:

@@ -184,9 +184,9 @@ def _stops(place: Place, measured: Measured) -> Iterator[tuple[tuple[str, float]
     visited = measured.values[measured.channel == joint]
     if not len(visited):
         return
-    loss = next(q.nominal for q in TERMS["joint_stop"].quantities if q.name == "loss")
+    usual = {q.name: q.nominal for q in TERMS["joint_stop"].quantities if q.shape}
     for side, quantile in ((-1.0, 0.03), (1.0, 0.97)):
-        told = {"angle": float(np.quantile(visited, quantile)), "side": side, "loss": loss}
+        told = usual | {"angle": float(np.quantile(visited, quantile)), "side": side}
         yield tuple((column("joint_stop", name, place), value) for name, value in told.items())
 
 

@@ -1,9 +1,9 @@
 """What each hypothesis changes in the samples, with as few simulations as can tell it.
 
-A hypothesis is simulated once, at a moderate size; of a single joint, where simulations cost
-little, at a small one too. While the torso is fixed, joints are simulated one by one, limbs sharing
-simulations, and what several joints change together is the sum of what each does. On the ground
-everything moves everything and a simulation costs five times as much: there joints are first
+A hypothesis is simulated once, at a moderate size; of a single joint in the air, where simulations
+cost little, at a small one too. While the torso is fixed, joints are simulated one by one, limbs
+sharing simulations, and what several joints change together is the sum of what each does. On the
+ground everything moves everything and a simulation costs five times as much: there joints are first
 simulated together, and one by one only where they look, together, like the errors.
 """
 
@@ -70,7 +70,7 @@ def traces(
         for h, whole in simulated(close, ground).items():
             wholes[h] = wholes[h] + whole
     told = [traced(h, wholes[h], project) for h in hypotheses]
-    if len(replays.measured.robot.joints) == 1:
+    if len(replays.measured.robot.joints) == 1 and not ground:
         small = _simulated(hypotheses, fixed, base, replays, noise, SMALL)
         again = [traced(h, small[h], project) for h in hypotheses]
         told = [_likelier(pair, base.residual) for pair in zip(told, again, strict=True)]
