@@ -1,9 +1,9 @@
 """How much of what a concealed robot records is its floor's doing.
 
-`python -m benchmarks.floors --seeds 1000 1001` has virtual robots stand up and walk on the spot,
-each on its own mat, on one with the time constant of the description's floor, and on a level one.
-It tells by how much joints and torso then move otherwise, until one of them leans too far: what a
-diagnosis could find at most, beside what encoders and the IMU can show.
+`python -m benchmarks.floors --seeds 1000 1001` has virtual robots stand up, shift their weight and
+walk on the spot, each on its own mat, on one with the time constant of the description's floor, and
+on a level one. It tells by how much joints and torso then move otherwise, until one of them leans
+too far: what a diagnosis could find at most, beside what encoders and the IMU can show.
 """
 
 import argparse
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(1000, 1010)))
     asked = parser.parse_args()
     robot = RobotDescription.load(asked.robot)
-    told = script(robot, ("standup:1.75", "standup:4"), np.random.default_rng(0))
+    told = script(robot, ("standup:1.75", "standup:4", "stand"), np.random.default_rng(0))
     plant = floored(robot, asked.seeds)
     for motion in (*told, walk_on_the_spot(robot)):
         joints, tilts = moved(plant, motion)

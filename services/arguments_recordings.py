@@ -98,8 +98,8 @@ def record(verb: argparse.ArgumentParser) -> None:
         "motions",
         nargs="+",
         metavar="MOTION",
-        help="step, standup, fall, hold, chirp or triangle; step:0.3 (rad), standup:2 (s) and "
-        "fall:left are single variants",
+        help="step, standup, stand, fall, hold, chirp or triangle; step:0.3 (rad), standup:2 (s) "
+        "and fall:left are single variants",
     )
     robot(verb, required=True)
     out(verb, "a file per recording or script; it may hold no others")

@@ -99,7 +99,7 @@ def test_stand_ups_go_from_squat_to_stand_in_the_time_named(
 @pytest.fixture(scope="module")
 def grounded(op2: RobotDescription) -> dict[str, np.ndarray]:
     """Roll and pitch of the nominal robot in each motion on the ground, shape (n_ticks, 2)."""
-    motions = made(op2, "standup", "fall")
+    motions = made(op2, "standup", "stand", "fall")
     recordings = [
         Recording(m.id, op2.name, m.motion, m.support, "simulation", op2.joint_names,
                   m.time, m.target, m.target)
@@ -128,6 +128,20 @@ def test_the_nominal_robot_stands_up_without_falling(grounded: dict[str, np.ndar
         tilt = grounded[f"standup_{seconds}"]
         assert np.abs(tilt).max() < 0.35
         assert np.abs(tilt[-1]).max() < 0.05
+
+
+def test_weight_goes_to_all_sides_and_the_robot_stays_on_its_feet(
+    op2: RobotDescription, grounded: dict[str, np.ndarray]
+) -> None:
+    (motion,) = made(op2, "stand", jitter=False)
+    assert (motion.support, motion.motion) == ("ground", "stand")
+    for row in (0, -1):
+        assert motion.target[row] == pytest.approx(op2.poses["stand"])
+    roll, pitch = grounded["stand"].T
+    assert roll.min() < -0.02 and roll.max() > 0.02
+    assert pitch.min() < -0.05 and pitch.max() > 0.05
+    assert max(np.abs(roll).max(), np.abs(pitch).max()) < 0.3
+    assert max(abs(roll[-1]), abs(pitch[-1])) < 0.02
 
 
 def test_falling_poses_of_the_two_sides_mirror_each_other(op2: RobotDescription) -> None:

@@ -88,11 +88,11 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Mat:
-    """What it stands on: a yoga mat on a board.
+    """What it stands on: a soft exercise mat on a board.
 
     Attributes:
       friction: sliding coefficient.
-      time: constant of the contact, s; hard floors have about 0.01 s.
+      time: constant of the contact, s; the description's floor, a hard one, has 0.02 s.
       damping: ratio of the contact.
       tilt: slopes of the floor along x and y, rad.
     """
@@ -164,7 +164,7 @@ def draw(seed: int, joints: int, bodies: int) -> Character:
         body=_body(rng, bodies),
         mat=Mat(
             friction=rng.uniform(0.5, 1.0),
-            time=rng.uniform(0.012, 0.03),
+            time=rng.uniform(0.035, 0.06),
             damping=rng.uniform(0.7, 1.2),
             tilt=rng.normal(0.0, 0.004, 2),
         ),

@@ -1,6 +1,7 @@
 """What could be recorded next: motions this robot can play, and what could be changed for them."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,6 @@ from pup.errors import InputError
 from pup.recording import Recording
 from pup.robot import Knob, RobotDescription
 from pup.sysid.excitation import PERIOD, Motion, possible_kinds, script
-from pup.sysid.lean import falling_pose
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ SCRIPTS = {
     "chirp": "a chirp to 5 Hz",
     "hold": "holds approached from both sides",
     "standup:2": "a stand-up within 2 s",
+    "stand": "shifting the weight while standing",
 }
 CHANGED = ("step:0.3", "triangle", "chirp", "hold", "standup:2")
 """Scripts that are also looked at with something else changed."""
@@ -38,10 +39,6 @@ OFF = 0.5
 """Time at which a drop's torque goes off, s."""
 DROP = 1.0
 """Time that it is off, s."""
-SHIFT = {"left": 0.2, "right": 0.2, "forward": 0.1, "backward": 0.1}
-"""Shares of the ways to the poses that topple a robot."""
-SHIFT_TIME = 0.8
-"""Time for each way, s."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +69,14 @@ class Option:
 def options(robot: RobotDescription, seed: int = 0) -> list[Option]:
     """All that a robot could be asked to do, the least effort first."""
     made = {}
+    possible = possible_kinds(robot)
     for kind in SCRIPTS:
-        if kind.partition(":")[0] in possible_kinds(robot):
-            made[kind] = script(robot, (kind,), np.random.default_rng(seed))[0]
+        if kind.partition(":")[0] in possible:
+            with suppress(InputError):  # nothing that it could lean with
+                made[kind] = script(robot, (kind,), np.random.default_rng(seed))[0]
     told = [_option(robot, motion, SCRIPTS[kind]) for kind, motion in made.items()]
     told.append(_option(robot, _multisine(made["chirp"]), "a multisine"))
     told.append(_drop(robot, made["triangle"]))
-    shift = _weight_shift(robot) if "standup:2" in made else None
-    if shift is not None:
-        told.append(_option(robot, shift, "shifting the weight while standing"))
     changed = [(made[kind], SCRIPTS[kind]) for kind in CHANGED if kind in made]
     for knob in robot.knobs:
         for value in _values(knob):
@@ -170,21 +166,3 @@ def _drop(robot: RobotDescription, triangle: Motion) -> Option:
     motion = replace(triangle, id="drop", motion="drop", time=time, target=target)
     power = np.where(time < OFF, 1.0, 0.0)
     return _option(robot, motion, "a drop with the torque off", power=power)
-
-
-def _weight_shift(robot: RobotDescription) -> Motion | None:
-    """Slow leans of a standing robot to all sides; None where it cannot lean."""
-    stand = np.array(robot.poses["stand"])
-    poses = [stand]
-    for way, share in SHIFT.items():
-        try:
-            poses += [stand + share * (falling_pose(robot, way) - stand), stand]
-        except InputError:
-            continue
-    if len(poses) == 1:
-        return None
-    corners = np.array(poses)
-    knots = SHIFT_TIME * np.arange(len(poses))
-    time = np.arange(round(knots[-1] / PERIOD), dtype=np.float64) * PERIOD
-    target = np.stack([np.interp(time, knots, column) for column in corners.T], axis=1)
-    return Motion("shift", "stand", "ground", time, target)

@@ -7,6 +7,7 @@ are in rad; for a slide joint, read the share of its range that the angle has of
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 PERIOD = 1 / 30  # s, between steady ticks
 JITTERED = (1 / 33, 1 / 25)  # s; the paper's robot is driven at 25 to 33 Hz
 LEAD = 0.1  # s at rest before a motion off the ground
+GROUND = ("standup", "stand", "fall")  # kinds that are played there
 
 STEP_SIZES = (0.1, 0.3, 0.6)  # rad (paper, section IV)
 STEP_INTERVAL = 0.25  # s; four moves in a second, as the authors recorded them
@@ -34,6 +36,11 @@ STANDUP_TIMES = (1.75, 2.0, 4.0, 6.0)  # s; the authors' recordings
 STILL = 0.5  # s at rest on the ground before anything moves, and after a stand-up
 LEAN_TIME = 0.3  # s; the fall is driven, so that a little noise in the start changes little
 FALL_TIME = 1.2  # s from the lean on
+
+SHIFTS = {"left": 0.4, "right": 0.4, "forward": 0.2, "backward": 0.2}
+"""How far a robot that stands leans to each side, a share of the way to the pose that topples it:
+as far as it stays on its feet, for the floor shows in how these turn under its weight."""
+SHIFT_TIME = 0.8  # s, each way
 
 HOLD_POSES = 3
 HOLD_OFFSET = 0.15  # rad; friction holds a servo back by a tenth of it
@@ -88,7 +95,7 @@ def possible_kinds(robot: RobotDescription) -> tuple[str, ...]:
     """The kinds of motion that a robot can play."""
     poses = {"stand", "squat"} <= robot.poses.keys()
     on_feet = robot.floating and robot.torso is not None and bool(robot.feet) and poses
-    return ("step", *(("standup", "fall") if on_feet else ()), "hold", "chirp", "triangle")
+    return ("step", *(GROUND if on_feet else ()), "hold", "chirp", "triangle")
 
 
 def script(
@@ -101,7 +108,7 @@ def script(
 
     Args:
       robot: who is to play them.
-      kinds: `step`, `standup`, `fall`, `hold`, `chirp` or `triangle`. One that comes in variants
+      kinds: `step`, `standup`, `stand`, `fall`, `hold`, `chirp` or `triangle`. One with variants
         may name one after a colon, as `step:0.3` (rad), `standup:2` (s) or `fall:left`; without
         it stands for all of the paper's. Every entry is drawn anew.
       rng: source of all that is random.
@@ -119,7 +126,7 @@ def script(
     for label, motion, make in made:
         course = make(robot, rng)
         time = _ticks(course.end, rng if jitter else None)
-        ground = motion in ("standup", "fall")
+        ground = motion in GROUND
         motions.append(
             Motion(
                 id=f"{label}_{seen[label]}" if repeated[label] > 1 else label,
@@ -165,7 +172,7 @@ def _variants(robot: RobotDescription, kind: str) -> list[tuple[str, str, _Make]
         return [(f"fall_{way}", motion, partial(_fall, direction=way)) for way in ways]
     if variant:
         raise InputError(f"motion {kind!r}: {motion} has no variants; use {motion!r}")
-    return [(motion, motion, {"hold": _hold, "chirp": _chirp, "triangle": _triangle}[motion])]
+    return [(motion, motion, _ALONE[motion])]
 
 
 def _number(kind: str, variant: str, lowest: float, highest: float) -> float:
@@ -266,6 +273,18 @@ def _fall(robot: RobotDescription, rng: np.random.Generator, direction: str) -> 
     return _ramped((0.0, STILL, LEAN_TIME, FALL_TIME), (stand, stand, lean, lean))
 
 
+def _stand(robot: RobotDescription, rng: np.random.Generator) -> _Course:
+    """Leans to all sides that it has, which shifts the weight over the feet."""
+    stand = np.array(robot.poses["stand"])
+    poses = [stand]
+    for way, share in SHIFTS.items():
+        with suppress(InputError):  # it does not lean that way
+            poses += [stand + share * (falling_pose(robot, way) - stand), stand]
+    if len(poses) == 1:
+        raise InputError(f"robot {robot.name!r} cannot shift its weight; leave out 'stand'")
+    return _ramped((0.0, STILL, *[SHIFT_TIME] * (len(poses) - 1)), (stand, *poses))
+
+
 def _hold(robot: RobotDescription, rng: np.random.Generator) -> _Course:
     room = _Room(robot, rng)
     reach = room.amplitude(HOLD_OFFSET)
@@ -324,3 +343,12 @@ def _ramped(gaps: Sequence[float], poses: Sequence[Array]) -> _Course:
         return np.stack([np.interp(time, knots, column) for column in corners.T], axis=1)
 
     return _Course(at, float(knots[-1]))
+
+
+_ALONE: dict[str, _Make] = {
+    "stand": _stand,
+    "hold": _hold,
+    "chirp": _chirp,
+    "triangle": _triangle,
+}
+"""Kinds without variants."""

@@ -70,7 +70,7 @@ class Recorded:
     motions: tuple[str, ...] = (
         *("step:0.1", "step:0.3", "step:0.6") * 2,
         *("hold", "triangle", "standup:1.75", "standup:4"),
-        *("fall:forward", "fall:backward", "fall:left", "fall:right"),
+        *("fall:forward", "fall:backward", "fall:left", "fall:right", "stand"),
     )
     repeats: int = 1
     fitted: tuple[str, ...] = ("step", "standup", "fall")
