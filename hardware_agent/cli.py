@@ -5,6 +5,7 @@ import json
 import logging
 import math
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from typing import Any
 from hardware_agent.config import Settings
 from hardware_agent.control import Unreachable, say
 from pup.errors import InputError
+from pup.files import MISTAKES
 from pup.usage import Usage
 
 DONE, FAILED, REFUSED = 0, 1, 2
@@ -21,6 +23,7 @@ PLACE = "/etc/pup-agent/agent.toml"
 SCRIPTS = "file of `pup record --scripts`, or a folder of them"
 SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
+NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")  # as gateways take them
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,6 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(VERBS[options.verb](options))
     except InputError as error:
         print(f"pup-agent {options.verb}: {' '.join(str(error).splitlines())}", file=sys.stderr)
+        return REFUSED
+    except MISTAKES as error:  # with a path that was given; what runs handles its own
+        print(f"pup-agent {options.verb}: {error.filename}: {error.strerror}", file=sys.stderr)
         return REFUSED
     except KeyboardInterrupt:
         return FAILED
@@ -186,6 +192,10 @@ def _knobs(told: Sequence[str]) -> dict[str, float]:
 def _keys(options: argparse.Namespace) -> int:
     import zmq.auth
 
+    if not NAME.fullmatch(options.name):
+        raise InputError(
+            f"{options.name[:70]!r} is no name: use 1 to 63 letters, digits, '-', '_' and '.'"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     if (options.out / f"{options.name}.key_secret").exists():
         raise InputError(f"{options.out}: there are keys of this name; use another")

@@ -68,15 +68,17 @@ class Table:
 
     def close(self) -> None:
         """Refuse keys that nobody asked for."""
+        known = ", ".join(sorted(set(self._known)))
         for key in self._rest:
-            raise self.mistake(key, f"unknown key; known here: {', '.join(sorted(self._known))}")
+            raise self.mistake(key, f"unknown key; known here: {known}")
 
     def left(self) -> list[str]:
         """The keys not taken yet, in file order."""
         return list(self._rest)
 
     def has(self, key: str) -> bool:
-        """Whether a key is present and not taken yet."""
+        """Whether a key is present and not taken yet; one that may be is known from here on."""
+        self._known.append(key)
         return key in self._rest
 
     def text(self, key: str) -> str:

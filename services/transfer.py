@@ -146,8 +146,11 @@ def token_of(given: str | None) -> str:
             raise InputError(f"--token-file: {given} cannot be read") from error
     else:
         token = os.environ.get("PUP_TOKEN", "").strip()
-    if not token or not token.isascii() or not token.isprintable():
+    if not token:
         raise InputError("no token; set PUP_TOKEN or give --token-file FILE")
+    if not token.isascii() or not token.isprintable():
+        place = f"--token-file: {given}" if given else "PUP_TOKEN"
+        raise InputError(f"{place}: no token, which is one line of letters, digits, '-' and '_'")
     return token
 
 

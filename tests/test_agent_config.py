@@ -115,4 +115,8 @@ def test_nobody_listening_is_unhealthy_and_not_a_mistake(
 def test_keys_are_made_once_and_secret(tmp_path: Path) -> None:
     assert main(["keys", "op2", "--out", str(tmp_path / "keys")]) == 0
     assert main(["keys", "op2", "--out", str(tmp_path / "keys")]) == 2
+    assert main(["keys", "../op3", "--out", str(tmp_path / "keys")]) == 2
+    assert not (tmp_path / "op3.key").exists()
+    (tmp_path / "file").touch()
+    assert main(["keys", "op2", "--out", str(tmp_path / "file")]) == 2
     assert (tmp_path / "keys" / "op2.key_secret").stat().st_mode & 0o077 == 0

@@ -12,6 +12,8 @@ from commandline import files, pup, pup_process
 from refusals import Cases, Made, Place, assert_refused, check
 
 from pup.files import write_json
+from pup.recording import Recording
+from pup.recording_cuts import beginning
 
 case = Cases()
 
@@ -25,6 +27,22 @@ def diagnose(place: Place, *recordings: object, robot: object = "servo_bench") -
 @case("diagnose: no recording")
 def _(place: Place) -> Made:
     return diagnose(place), ("RECORDING",)
+
+
+def test_recordings_that_are_next_to_nothing_are_undetermined(
+    bench_recordings: Path, tmp_path: Path
+) -> None:
+    """With a report as well as a document, though no reading is left to be compared."""
+    whole = Recording.read(sorted(bench_recordings.glob("*.parquet"))[0])
+    beginning(whole, 0.0).write(tmp_path / "short.parquet")
+    made = pup(
+        *("diagnose", tmp_path / "short.parquet", "--robot", "servo_bench", "--local"),
+        *("--out", tmp_path / "out"),
+    )
+    assert made.code == 0, made.err
+    told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert told["verdict"] == "undetermined"
+    assert "too few to tell anything" in (tmp_path / "out" / "report.html").read_text()
 
 
 @case("diagnose: a folder without recordings")

@@ -265,7 +265,7 @@ def test_what_is_less_likely_than_not_is_told_as_such(backlash: Diagnosis, tmp_p
     assert "1Perhaps: " not in shown.text
     unsure = (replace(first, probability=0.4, equivalents=()), drag)
     assert (
-        "Most likely, the simulator lacks 2 effects."
+        "Perhaps the simulator lacks 2 effects."
         in page(replace(backlash, findings=unsure), tmp_path).text
     )
 
@@ -293,6 +293,9 @@ def test_a_likely_finding_is_told_as_such(backlash: Diagnosis, tmp_path: Path) -
     unsure = replace(backlash.findings[0], probability=0.5)
     shown = page(replace(backlash, findings=(unsure,)), tmp_path)
     assert "Most likely: The left knee loses" in shown.text
+    doubtful = replace(backlash.findings[0], probability=0.3, equivalents=())
+    shown = page(replace(backlash, findings=(doubtful,)), tmp_path)
+    assert "Perhaps: The left knee loses" in shown.text
 
 
 @pytest.mark.parametrize("name", built_in_robots())

@@ -72,8 +72,9 @@ def test_a_stop_that_nobody_hears_is_told_so(service):
         asked = STUDY | {"name": "stopped", "agent": "gone"}
         http.post("/v1/studies", json=asked)
         until(lambda: any(a["name"] == "gone" for a in _agents(http)))
-        answer = http.post("/v1/agents/gone:stop", json={"reason": "smoke"})
-        assert answer.status_code == 409 and "use the switch" in answer.json()["detail"]
+        for body in ({"json": {"reason": "smoke"}}, {}, {"content": b"{not json"}, {"json": [1]}):
+            answer = http.post("/v1/agents/gone:stop", **body)  # whatever it says, a stop is one
+            assert answer.status_code == 409 and "use the switch" in answer.json()["detail"]
         assert http.get("/v1/studies/stopped").json()["state"] == "paused"
         walk = fake_agent.walks(lambda eta: 0.5)
         with fake_agent.FakeAgent(*keys, service.link, walk) as agent:

@@ -90,7 +90,8 @@ def test_any_curve_can_be_drawn(values: list[float | None]) -> None:
     ("changed", "sentence"),
     [
         ({}, "The simulator lacks backlash at joint knee."),
-        ({"findings": [FINDING | {"probability": 0.3}]}, "Most likely the simulator lacks"),
+        ({"findings": [FINDING | {"probability": 0.3}]}, "Perhaps the simulator lacks"),
+        ({"findings": [FINDING | {"probability": 0.6}]}, "Most likely the simulator lacks"),
         (
             {"findings": [FINDING, FINDING | {"effect": "encoder_bias"}]},
             "The simulator lacks backlash and encoder bias.",

@@ -8,7 +8,7 @@ import pytest
 from pup.diagnosis import starts
 from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fit import Fit
-from pup.diagnosis.fitting import complete, fit_together
+from pup.diagnosis.fitting import complete, fit_together, start_best
 from pup.diagnosis.folds import NOMINAL, without_samples
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.noise import assumed_noise
@@ -34,6 +34,13 @@ def nominal(**changed: float) -> Fit:
     coordinates = tuple(nominal_coordinate(SPACE, n) for n in free_names(SPACE, ground=False))
     values = {n: float(SPACE.nominal[SPACE.names.index(n)]) for n in SPACE.names} | changed
     return Fit(coordinates, np.array([c.coordinate(values[c.name]) for c in coordinates]))
+
+
+def test_where_nothing_is_chosen_nothing_is_begun(replays: Replays) -> None:
+    """Recordings of a second or two leave nothing to go on with."""
+    count = replays.count
+    start_best([], [], replays, assumed_noise(replays.measured))
+    assert replays.count == count
 
 
 def test_a_fit_that_ends_far_from_the_description_is_begun_there_too(replays: Replays) -> None:

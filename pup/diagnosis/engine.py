@@ -313,7 +313,11 @@ def _explained(
     missing = missing_input(nominal.fit, replays, nominal.noise)
     before, after = (splits(fit, replays, nominal.noise) for fit in (nominal.fit, told.model.fit))
     task.progress("findings", 0.92)
-    named = findings(model, told.rounds, selector, task.measured, seen) if model.hypotheses else ()
+    named = (
+        findings(model, told.rounds, selector, task.measured, seen, told.model)
+        if model.hypotheses
+        else ()
+    )
     task.progress("next recording", 0.95)
     ask = _next(named, told.rounds, selector, task.replays_of)
     nameless = beside(left.finding, named, told.robot) if left else odd

@@ -79,6 +79,8 @@ def start_best(
       noise: weighs the samples.
     """
     tried = [(fit, at) for fit, places in zip(fits, options, strict=True) for at in places]
+    if not tried:
+        return
     simulated = replays([fit.row(at) for fit, at in tried])
     residuals = _residuals([fit for fit, _ in tried], simulated, replays, noise)
     for (fit, at), residual in zip(tried, residuals, strict=True):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from pup.errors import InputError
 from pup.recording import Recording
 from pup.recording_cuts import between, cut
 
@@ -43,7 +44,10 @@ def pieces(recordings: Sequence[Recording]) -> list[Recording]:
     starts = _spaced(elapsed[_wakes(whole)], elapsed[-1])
     if len(starts) < FEWEST:
         return [whole]
-    return [cut(whole, start, stop) for start, stop in pairwise([*starts, np.inf])]
+    try:
+        return [cut(whole, start, stop) for start, stop in pairwise([*starts, np.inf])]
+    except InputError:  # in one of them a joint was never read
+        return [whole]
 
 
 def origins(

@@ -135,15 +135,16 @@ class _Report:
                 )
             least = self.error(summary.smallest_material(diagnosis))
             return f"Nothing material is missing from the simulator beyond {least}."
-        unsure = min(finding.probability for finding in diagnosis.findings) < SURE
         if len(self.items) == 1:
-            return ("Most likely: " if unsure else "") + self.single()
+            unsure = min(finding.probability for finding in diagnosis.findings) < SURE
+            perhaps = "Perhaps: " if self.items[0].doubtful else "Most likely: "
+            return (perhaps if unsure else "") + self.single()
         known = [item for item in self.items if item.effect != NAMELESS]
         sure = [item for item in known if not item.doubtful] or known
         lacks = sure[0].name if len(sure) == 1 else f"{len(sure)} effects"
         beyond = f", perhaps {len(known) - len(sure)} more" if len(sure) < len(known) else ""
         beyond += f", and {WORDS[NAMELESS]}" if len(known) < len(self.items) else ""
-        likely = "Most likely, the" if sure[0].doubtful else "The"
+        likely = "Perhaps the" if sure[0].doubtful else "The"
         return f"{likely} simulator lacks {lacks}{beyond}."
 
     def single(self) -> str:

@@ -64,9 +64,9 @@ def _takeaway(told: Mapping[str, tuple[float, float]], speech: Speech, corrected
         return f"The largest error is that of {name}: {thousandths(told[name][0])} {small}."
     name = max(told, key=lambda n: told[n][0] ** 2 - told[n][1] ** 2)
     before, after = told[name]
-    worse = [n for n, (b, a) in told.items() if a > 1.02 * b]
+    worse = [f"{n} by {percent(a / b - 1)}" for n, (b, a) in told.items() if a > 1.02 * b]
     name = capital(name)
-    but = f" Worse by more than 2 %: {listed(worse)}." if worse else " None gets worse."
+    but = f" Worse: {listed(worse)}." if worse else " None gets worse."
     return (
         f"{name} gains most: from {thousandths(before)} to {thousandths(after)} {small} "
         f"({percent(1 - after / before)} less).{but}"

@@ -21,7 +21,8 @@ BAND = 1.645
 def nominal(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     """Certificate, noise, parameters and recordings."""
     yield tag("p", _certificate(diagnosis))
-    yield tag("p", _noise(diagnosis, speech))
+    if len(diagnosis.measured.values):
+        yield tag("p", _noise(diagnosis, speech))
     yield tag(
         "p",
         f"{len(diagnosis.measured.values):,} readings were compared with "

@@ -64,7 +64,7 @@ def _worst(lacks: Sequence[Lack], speech: Speech) -> str:
     if worst.repeated is not None and worst.repeated > SEEN**2:
         parts.append(f"{_root(worst.repeated)} come back when a motion is repeated")
     if worst.explained > SEEN**2:
-        parts.append(f"a torque would explain {_root(worst.explained)}")
+        parts.append(f"a torque would explain {_root(_by_torque(worst))}")
     more = f", of which {listed(parts)}" if parts else ""
     where = speech.channels()[worst.channel]
     return f"Clearest at the {where}: errors are {_root(1 + worst.excess)} times the noise{more}."
@@ -107,7 +107,7 @@ def _table(lacks: Sequence[Lack], speech: Speech) -> Html:
             f"{max(one.surprise, 0.0):.1f} sd",
             "not repeated" if one.repeated is None else _root(one.repeated),
             "" if one.repeated is None else f"{max(one.repeated_surprise, 0.0):.1f} sd",
-            _root(one.explained),
+            _root(_by_torque(one)),
         )
         for one in lacks
     ]
@@ -117,6 +117,11 @@ def _table(lacks: Sequence[Lack], speech: Speech) -> Html:
         "sd: standard deviations."
     )
     return table(caption, columns, rows)
+
+
+def _by_torque(one: Lack) -> float:
+    """Mean square that a torque explains; on one channel it may be more than the error there."""
+    return min(one.explained, 1 + one.excess)
 
 
 def _root(square: float) -> str:

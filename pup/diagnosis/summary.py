@@ -102,7 +102,7 @@ def by_regime(diagnosis: Diagnosis, fit: Fit) -> tuple[list[str], Array]:
         ]
         for c in channels(diagnosis)
     ]
-    return [name for name, _ in columns], np.array(rows)
+    return [name for name, _ in columns], np.array(rows).reshape(-1, len(columns))
 
 
 def by_time(diagnosis: Diagnosis, fit: Fit, recording: int, most: int) -> tuple[Array, Array]:

@@ -129,6 +129,7 @@ def findings(
     selector: Selector,
     measured: Measured,
     found: Sequence[Regime],
+    corrected: Model,
 ) -> tuple[Finding, ...]:
     """What the final model adds to the nominal one, most important first.
 
@@ -138,6 +139,8 @@ def findings(
       selector: knows the traces and simulates.
       measured: the samples.
       found: the regimes of motion.
+      corrected: the final model, or with a law that was read off beside its effects: that of the
+        corrected robot, whose sizes are told.
     """
     nominal = selector.nominal
     left = left_over(final, selector.noise)
@@ -156,11 +159,11 @@ def findings(
                 place=hypothesis.place,
                 regime=strongest(found, squares),
                 when=tuple(windows(measured, squares)),
-                parameters=_parameters(hypothesis, final)
-                | _uneven(hypothesis, final, selector.noise),
+                parameters=_parameters(hypothesis, corrected)
+                | _uneven(hypothesis, corrected, selector.noise),
                 probability=probability,
                 equivalents=rivals,
-                absorbed_by=_absorbed(nominal, final),
+                absorbed_by=_absorbed(nominal, corrected),
                 law=EQUATIONS[hypothesis.effect],
                 gain=gain,
                 size=final.size(hypothesis),

@@ -22,17 +22,22 @@ MAX_FILE = 256 * 2**20  # bytes
 def read(path: Path, options: ImportOptions) -> list[Recording]:
     """Read one table."""
     lines = read_text(path, MAX_FILE).replace("\r\n", "\n").rstrip("\n").split("\n")
+    if lines == [""]:
+        raise InputError("line 1: the file is empty")
     known: dict[str, Any] = {"id": path.stem}
     skipped = 0
     if lines and lines[0].startswith(MARK):
-        known |= _header(parse_json(lines[0][len(MARK) :]))
+        try:
+            known |= _header(parse_json(lines[0][len(MARK) :]))
+        except InputError as error:
+            raise InputError(f"line 1, {MARK.rstrip(':')}: {error}") from error
         skipped = 1
     return [from_columns(options.metadata(known), _columns(lines[skipped:], skipped))]
 
 
 def _header(metadata: object) -> dict[str, Any]:
     if item(metadata, "schema") != 1:
-        raise InputError(f"line 1: schema is {item(metadata, 'schema')!r}; this version reads 1")
+        raise InputError(f"schema is {item(metadata, 'schema')!r}; this version reads 1")
     assert isinstance(metadata, dict)  # as `item` has seen
     return metadata
 

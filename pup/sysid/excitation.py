@@ -37,9 +37,9 @@ STILL = 0.5  # s at rest on the ground before anything moves, and after a stand-
 LEAN_TIME = 0.3  # s; the fall is driven, so that a little noise in the start changes little
 FALL_TIME = 1.2  # s from the lean on
 
-SHIFTS = {"left": 0.4, "right": 0.4, "forward": 0.2, "backward": 0.2}
+SHIFTS = {"left": 0.4, "right": 0.4, "forward": 0.15, "backward": 0.15}
 """How far a robot that stands leans to each side, a share of the way to the pose that topples it:
-as far as it stays on its feet, for the floor shows in how these turn under its weight."""
+far, for the floor shows in how the feet turn under its weight, but weak servos stay up too."""
 SHIFT_TIME = 0.8  # s, each way
 
 HOLD_POSES = 3
@@ -282,7 +282,8 @@ def _stand(robot: RobotDescription, rng: np.random.Generator) -> _Course:
             poses += [stand + share * (falling_pose(robot, way) - stand), stand]
     if len(poses) == 1:
         raise InputError(f"robot {robot.name!r} cannot shift its weight; leave out 'stand'")
-    return _ramped((0.0, STILL, *[SHIFT_TIME] * (len(poses) - 1)), (stand, *poses))
+    gaps = (0.0, STILL, *[SHIFT_TIME] * (len(poses) - 1), STILL)
+    return _ramped(gaps, (stand, *poses, stand))
 
 
 def _hold(robot: RobotDescription, rng: np.random.Generator) -> _Course:

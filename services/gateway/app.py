@@ -44,6 +44,8 @@ from services.gateway.shapes import (
     StudyShape,
     TrialList,
     TrialShape,
+    reason_in,
+    reason_or_none,
 )
 from services.gateway.store import Store
 
@@ -151,7 +153,7 @@ class _Guard:
 
     def _refusal(self, scope: Scope) -> Response | None:
         told = dict(scope["headers"])
-        length = told.get(b"content-length", b"" if scope["method"] == "POST" else b"0")
+        length = told.get(b"content-length", b"0")  # without one, and not chunked: no body
         if b"transfer-encoding" in told or not length.isdigit():
             return problem(411, "a Content-Length is needed", Request(scope))
         if int(length) > BODY_LIMIT:
@@ -345,15 +347,19 @@ async def stream_agents(request: Request, _: Viewer) -> Response:
     return stream(request, "")
 
 
-@emergency.post("/agents/{agent:name}:stop", status_code=202, responses=WRITE)
+@emergency.post(
+    "/agents/{agent:name}:stop", status_code=202, responses=WRITE, openapi_extra=reason_or_none()
+)
 async def stop_agent(
-    request: Request, user: Operator, agent: AgentName, why: Reason, key: IdempotencyKey = None
+    request: Request, user: Operator, agent: AgentName, key: IdempotencyKey = None
 ) -> Response:
     """Emergency stop by message; the switch at the robot is faster. Each request sends one.
 
-    The answer's `unwritten` tells what could not be written within 2 s.
+    It needs no body, and none keeps it from stopping. The answer's `unwritten` tells what could not
+    be written within 2 s.
     """
-    unwritten = await stops.stop(conductor_of(request), agent, user.name, why.reason)
+    reason = reason_in(await request.body())
+    unwritten = await stops.stop(conductor_of(request), agent, user.name, reason)
     return as_json({"stopped": agent, "unwritten": unwritten}, 202)
 
 

@@ -9,6 +9,7 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    ValidationError,
     model_validator,
 )
 
@@ -108,6 +109,20 @@ class Reason(Strict):
     """Why, in words."""
 
     reason: Annotated[str, Field(min_length=1, max_length=500, pattern=r"^[^\x00]+$")]
+
+
+def reason_in(body: bytes) -> str:
+    """The reason in a body that may be anything: nothing is refused for want of one."""
+    try:
+        return Reason.model_validate_json(body).reason
+    except ValidationError:
+        return "no reason given"
+
+
+def reason_or_none() -> dict[str, Any]:
+    """How OpenAPI tells of such a body."""
+    told = {"application/json": {"schema": Reason.model_json_schema()}}
+    return {"requestBody": {"required": False, "content": told}}
 
 
 class StudyShape(BaseModel):
