@@ -65,6 +65,11 @@ def test_what_is_missing_is_found_and_the_corrected_robot_replays_better(
     robot = RobotDescription.load(str(whole / "diagnosis" / "corrected"))
     digest = told["corrected-presysid"]["provenance"]["robot_digest"]
     assert robot.terms and digest == robot.digest
+    added = {(t.effect, t.kind): t.values for t in robot.terms}
+    for finding in json.loads((whole / "diagnosis/diagnosis.json").read_text())["findings"]:
+        values = added.get((finding["effect"], finding["place"]["kind"]), {})
+        for name in values.keys() & finding["parameters"].keys():
+            assert finding["parameters"][name]["value"] == pytest.approx(values[name])
 
 
 def test_the_values_of_the_diagnosis_stay_and_bounds_are_found_around_them(whole: Path) -> None:
