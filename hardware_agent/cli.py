@@ -38,9 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"pup-agent {options.verb}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return REFUSED
-    except MISTAKES as error:  # with a path that was given; what runs handles its own
-        print(f"pup-agent {options.verb}: {error.filename}: {error.strerror}", file=sys.stderr)
-        return REFUSED
     except KeyboardInterrupt:
         return FAILED
 
@@ -196,12 +193,17 @@ def _keys(options: argparse.Namespace) -> int:
         raise InputError(
             f"{options.name[:70]!r} is no name: use 1 to 63 letters, digits, '-', '_' and '.'"
         )
-    options.out.mkdir(parents=True, exist_ok=True)
-    if (options.out / f"{options.name}.key_secret").exists():
-        raise InputError(f"{options.out}: there are keys of this name; use another")
-    for file in zmq.auth.create_certificates(options.out, options.name):
+    secret = options.out / f"{options.name}.key_secret"
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        if secret.exists():
+            raise InputError(f"{options.out}: there are keys of this name; use another")
+        made = zmq.auth.create_certificates(options.out, options.name)
+        os.chmod(secret, 0o600)
+    except MISTAKES as error:
+        raise InputError(f"--out: {error.filename}: {error.strerror}") from error
+    for file in made:
         print(file)
-    os.chmod(options.out / f"{options.name}.key_secret", 0o600)
     return DONE
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pup.errors import InputError
+from pup.files import MISTAKES
 
 SCHEMA = 1
 
@@ -23,14 +24,17 @@ class Journal:
       file: made when absent.
 
     Raises:
-      InputError: the file is damaged, or of another version.
+      InputError: the file is damaged, of another version, or cannot be where it is to be.
     """
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        file.parent.mkdir(parents=True, exist_ok=True)
-        fresh = not file.exists()
-        self._handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o640)
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            fresh = not file.exists()
+            self._handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o640)
+        except MISTAKES as error:
+            raise InputError(f"{file}: cannot be written ({error.strerror})") from error
         if fresh:
             self.append({"event": "journal", "schema": SCHEMA})
             folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)

@@ -8,6 +8,7 @@ from agents import CONFIG, changed
 
 from hardware_agent.cli import main
 from hardware_agent.config import SafetySettings, Settings
+from hardware_agent.journal import Journal
 from pup.errors import InputError
 
 WHOLE = CONFIG.format(folder="/tmp/nowhere", protocol=1, clock="wall")
@@ -119,4 +120,6 @@ def test_keys_are_made_once_and_secret(tmp_path: Path) -> None:
     assert not (tmp_path / "op3.key").exists()
     (tmp_path / "file").touch()
     assert main(["keys", "op2", "--out", str(tmp_path / "file")]) == 2
+    with pytest.raises(InputError, match="file/journal: cannot be written"):
+        Journal(tmp_path / "file" / "journal")
     assert (tmp_path / "keys" / "op2.key_secret").stat().st_mode & 0o077 == 0

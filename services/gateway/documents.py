@@ -208,6 +208,6 @@ class DiagnosisDocument(Document):
             told = " and ".join(filter(None, (", ".join(known[:-1]), known[-1])))
         beyond = ", and more that has no name" if len(named) < len(self.findings) else ""
         sure = all(f.probability >= SURE for f in named)
-        likely = all(f.probability > 0.5 for f in named)
+        likely = all(f.probability + sum(e.probability for e in f.equivalents) > 0.5 for f in named)
         begin = "The" if sure else "Most likely the" if likely else "Perhaps the"
         return f"{begin} simulator lacks {told}{beyond}."
