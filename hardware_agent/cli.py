@@ -23,7 +23,6 @@ PLACE = "/etc/pup-agent/agent.toml"
 SCRIPTS = "file of `pup record --scripts`, or a folder of them"
 SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
-NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")  # as gateways take them
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -189,7 +188,9 @@ def _knobs(told: Sequence[str]) -> dict[str, float]:
 def _keys(options: argparse.Namespace) -> int:
     import zmq.auth
 
-    if not NAME.fullmatch(options.name):
+    from pup.wire import NAME
+
+    if not re.fullmatch(NAME, options.name):
         raise InputError(
             f"{options.name[:70]!r} is no name: use 1 to 63 letters, digits, '-', '_' and '.'"
         )

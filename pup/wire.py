@@ -25,6 +25,7 @@ from pup.wire_values import pack, plain, read, unpack
 VERSION = 1
 CHUNK = 2**18  # bytes of a recording in one message
 FASTEST = 5.0  # m/s
+NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,62}"  # pattern of names of studies, agents and tokens
 
 
 class AgentState(StrEnum):

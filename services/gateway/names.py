@@ -4,14 +4,15 @@ import re
 
 from starlette.convertors import Convertor, register_url_convertor
 
-PATTERN = "[A-Za-z0-9][A-Za-z0-9_.-]{0,62}"
-WHOLE = f"^{PATTERN}$"
+from pup.wire import NAME
+
+WHOLE = f"^{NAME}$"
 
 
 class _Name(Convertor[str]):
     """A name in a path, which ends before the colon of an action."""
 
-    regex = PATTERN
+    regex = NAME
 
     def convert(self, value: str) -> str:
         return value
@@ -25,4 +26,4 @@ register_url_convertor("name", _Name())
 
 def is_name(text: str) -> bool:
     """Whether a text is a name."""
-    return re.fullmatch(PATTERN, text) is not None
+    return re.fullmatch(NAME, text) is not None
