@@ -1,7 +1,7 @@
 """What could be recorded next: motions this robot can play, and what could be changed for them."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,7 +72,8 @@ def options(robot: RobotDescription, seed: int = 0) -> list[Option]:
     possible = possible_kinds(robot)
     for kind in SCRIPTS:
         if kind.partition(":")[0] in possible:
-            with suppress(InputError):  # nothing that it could lean with
+            # It may have nothing to lean with; what else cannot be played is told as before.
+            with suppress(InputError) if kind == "stand" else nullcontext():
                 made[kind] = script(robot, (kind,), np.random.default_rng(seed))[0]
     told = [_option(robot, motion, SCRIPTS[kind]) for kind, motion in made.items()]
     told.append(_option(robot, _multisine(made["chirp"]), "a multisine"))
