@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
 
 from pup.diagnosis.coordinates import term_coordinate
 from pup.diagnosis.discover import beside
 from pup.diagnosis.doubts import doubt, left_outside, left_over
-from pup.diagnosis.evidence import Score, Trace
+from pup.diagnosis.evidence import Projector, Score, Trace, scores, traced
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import hypotheses
 from pup.diagnosis.models import Model, Round
@@ -85,6 +88,50 @@ def test_what_is_lost_on_motions_left_out_is_left_besides() -> None:
 def rival(effect: str, error: float, held_out: float = 0.0) -> Model:
     model = left(MEASURED, error, held_out)
     return replace(model, hypotheses=(score(effect, 1.0, 1.0).trace.hypothesis,))
+
+
+def test_of_what_fits_alike_the_usual_law_is_likelier() -> None:
+    """Friction that rises at rest is described seldom, and has a law of more freedom."""
+    noise, before = Noise(np.full(3, 0.002), np.zeros(3), "repeats"), left(MEASURED, 20.0)
+    usual, rising = rival("stribeck_friction", 1.0), rival("rising_static_friction", 1.0)
+    assert usual.worth < rising.worth
+    likely, rare = probabilities([usual, rising], before, noise)
+    assert likely > 2 * rare > 0.1
+    worse = rival("stribeck_friction", 1.5)  # what explains much more is meant all the same
+    assert probabilities([rising, worse], before, noise)[0] > 0.85
+
+
+@given(
+    statistic=st.floats(0.1, 3000.0),
+    freedom=st.integers(1, 4),
+    more=st.floats(1.01, 2.0),
+)
+def test_a_score_of_several_magnitudes_is_as_improbable_as_that_of_one(
+    statistic: float, freedom: int, more: float
+) -> None:
+    trace = score("command_delay", 1.0, 1.0).trace
+    told = Score(trace, statistic, freedom, np.ones(freedom)).surprise
+    assert told <= statistic + 1e-9
+    assert told < Score(trace, more * statistic, freedom, np.ones(freedom)).surprise
+    if stats.chi2.logsf(statistic, freedom) > -250:
+        wanted = stats.chi2.logsf(statistic, freedom)
+        assert stats.chi2.logsf(told, 1) == pytest.approx(wanted, rel=1e-6, abs=1e-9)
+
+
+def test_sizes_that_a_score_asks_for_are_those_of_least_squares() -> None:
+    """Of one magnitude, told without a decomposition, as of two."""
+    rng = np.random.default_rng(0)
+    project = Projector(rng.normal(size=(50, 3)))
+    errors = project(rng.normal(size=(50, 1)))[:, 0]
+    hypothesis = score("clock_skew", 1.0, 1.0).trace.hypothesis
+    for columns in (1, 2):
+        trace = traced(hypothesis, rng.normal(size=(50, columns)), project)
+        assert trace is not None
+        (told,) = scores([trace], errors)
+        wanted, (rest,), *_ = np.linalg.lstsq(trace.left, errors, rcond=None)
+        assert told.sizes == pytest.approx(wanted)
+        assert told.statistic == pytest.approx(errors @ errors - rest)
+        assert trace.basis.T @ trace.basis == pytest.approx(np.eye(columns))
 
 
 def test_a_sibling_that_explains_nearly_as_much_keeps_a_part_of_what_its_class_is_given() -> None:

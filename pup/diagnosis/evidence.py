@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis
@@ -21,6 +21,8 @@ SEEN = 1e-3
 """A trace of which less than this share is left after projection cannot be told at all."""
 FAINT = 0.3
 """A trace whose whitened length at typical size is below this is not worth a test."""
+FARTHEST = 1e-130
+"""Chances below this are too small for the tables of their distributions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +67,12 @@ class Score:
     @property
     def surprise(self) -> float:
         """The statistic as that of a single magnitude of the same improbability."""
-        tail = stats.chi2.logsf(self.statistic, self.freedom)
         if self.freedom == 1:
             return self.statistic
-        if tail < -300:  # beyond the table's end: what the extra magnitudes cost there
+        chance = float(special.chdtrc(self.freedom, self.statistic))
+        if chance < FARTHEST:  # what the extra magnitudes cost there
             return float(self.statistic - (self.freedom - 1) * np.log(self.statistic))
-        return float(stats.chi2.isf(np.exp(tail), 1))
+        return float(special.chdtri(1, chance))
 
 
 class Projector:
@@ -98,9 +100,18 @@ def traced(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | 
 
 def _seen(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | None:
     left = project(whole)
-    vectors, lengths, _ = np.linalg.svd(left, full_matrices=False)
+    vectors, lengths = _directions(left)
     seen = (lengths > FAINT) & (lengths > SEEN * np.linalg.norm(whole))
     return Trace(hypothesis, whole, left, vectors[:, seen]) if seen.any() else None
+
+
+def _directions(columns: Array) -> tuple[Array, Array]:
+    """Orthonormal directions of columns (n_samples, n), and how long they are along each."""
+    if columns.shape[1] == 1:  # as nearly all of them are: no decomposition
+        length = np.linalg.norm(columns, axis=0)
+        return columns / np.maximum(length, np.finfo(float).tiny), length
+    vectors, lengths, _ = np.linalg.svd(columns, full_matrices=False)
+    return vectors, lengths
 
 
 def scores(found: Sequence[Trace], residual: Array) -> list[Score]:
@@ -130,6 +141,8 @@ def foremost(ranking: Sequence[Score], most: int, refitted: Collection[Hypothesi
 
 
 def _sizes(trace: Trace, residual: Array) -> Array:
+    if trace.left.shape[1] == 1:
+        return np.asarray(trace.left.T @ residual / np.sum(trace.left**2))
     return np.asarray(np.linalg.lstsq(trace.left, residual, rcond=1e-3)[0])
 
 
@@ -172,7 +185,7 @@ def _as_of_one(statistic: Array, freedom: int) -> Array:
     """Statistics as those of a single magnitude that are as improbable."""
     if freedom == 1:
         return statistic
-    return np.asarray(stats.chi2.isf(stats.chi2.sf(statistic, freedom), 1))
+    return np.asarray(special.chdtri(1, special.chdtrc(freedom, statistic)))
 
 
 def overlap(a: Trace, b: Trace) -> float:

@@ -10,7 +10,7 @@ from pup.diagnosis.evidence import Score
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.hypotheses import Hypothesis
 from pup.diagnosis.residuals import Measured
-from pup.physics.terms import Place
+from pup.physics.terms import TERMS, Place
 
 Array = NDArray[np.float64]
 
@@ -56,17 +56,18 @@ class Model:
     def worth(self) -> float:
         """What it costs: half its chi-squared in sample, half out of it, and its complexity.
 
-        And how unusual its sizes are: an encoder that is off by a tenth of a radian is rarer than a
-        load whose centre is off by a centimetre, which moves a servo in the same way.
+        And how unusual its laws and sizes are: an encoder that is off by a tenth of a radian is
+        rarer than a load whose centre is off by a centimetre, which moves a servo in the same way.
         """
         inside = self.fit.chi2 + self.freedom * float(np.log(self.samples))
         return (inside + float(self.held_out.sum())) / 2 + 2 * TEMPERATURE * self._strange()
 
     def _strange(self) -> float:
-        """How unusual its effects' sizes are: minus the logarithm of how often they are seen."""
+        """How unusual its effects are: minus the logarithm of how often they are seen."""
         own = {name for hypothesis in self.hypotheses for name in hypothesis.magnitudes}
         free = np.array([name in own for name in self.fit.names], dtype=bool)
-        return float(np.log1p((self.fit.at[free] / USUAL) ** 4).sum())
+        sizes = float(np.log1p((self.fit.at[free] / USUAL) ** 4).sum())
+        return sizes + sum(TERMS[hypothesis.effect].rarity for hypothesis in self.hypotheses)
 
 
 @dataclass(frozen=True, eq=False)

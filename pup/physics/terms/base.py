@@ -190,6 +190,8 @@ class Term:
         as one of those does.
       least: share of its typical size below which it is another thing, whatever it explains: what
         gives way as a spring does is no stop.
+      rarity: logarithm of how much rarer it is than others of its class: of two laws that explain
+        as much, the usual one is meant.
       needs_law_damping: whether it needs `Flow.law_damping`.
       state: attributes that carry over from sub-step to sub-step, rows of simulations; NaN where
         one has just started and a first sub-step says what they begin with.
@@ -209,6 +211,7 @@ class Term:
     one_way: ClassVar[bool] = False
     telling: ClassVar[tuple[str, ...]] = ()
     least: ClassVar[float] = 0.0
+    rarity: ClassVar[float] = 0.0
     needs_law_damping: ClassVar[bool] = False
     state: ClassVar[tuple[str, ...]] = ()
 

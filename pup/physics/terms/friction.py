@@ -114,6 +114,7 @@ class RisingStaticFriction(Friction):
         Quantity("slip", "rad", 0.03, 0.3, grid=(0.01, 0.05)),
     )
     telling = ("time",)
+    rarity = 1.1  # a third: Coulomb and Stribeck friction are what robots are described with
     source = "sizes as of Stribeck friction; time 0 to 200 s (Armstrong-Helouvry et al. 1994)"
     state = ("_bend", "_age")
 
