@@ -31,6 +31,7 @@ from pup.diagnosis.materiality import astray, improves, little, matters
 from pup.diagnosis.models import Model, Round, chosen_in
 from pup.diagnosis.noise import assumed_noise, told_anew
 from pup.diagnosis.nominal import Nominal, certified, fit_nominal, unfitted
+from pup.diagnosis.patchwork import patched
 from pup.diagnosis.pieces import origins, pieces
 from pup.diagnosis.poor import why_poor
 from pup.diagnosis.regimes import Regime, regimes
@@ -320,7 +321,11 @@ def _explained(
     )
     task.progress("next recording", 0.95)
     ask = _next(named, told.rounds, selector, task.replays_of)
-    nameless = beside(left.finding, named, told.robot) if left else odd
+    assert told.held_out is not None
+    known = left.finding if left else odd
+    nameless = patched(named, known, told.held_out, told.model, nominal.noise, seen)
+    if nameless and (left or not odd):
+        nameless = beside(nameless, named, told.robot)
     return replace(
         told,
         verdict="mismatch",

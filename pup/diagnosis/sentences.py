@@ -136,6 +136,12 @@ def _nameless(diagnosis: Diagnosis, finding: Finding, speech: Speech) -> str:
             f" and does not repeat: a motion done again differs by {speech.quantity(apart, 'rad')}"
             f", {apart / flutter:.0f} times what its readings flutter by"
         )
+    if "astray" in finding.parameters:
+        times = digits(finding.parameters["astray"].value)
+        like = (
+            ": the effects that are told of may be patches for it, and leave "
+            f"{times} times the noise on motions that were left out"
+        )
     return f"{capital(WORDS[NAMELESS])} happens {where}{like}."
 
 

@@ -43,6 +43,7 @@ _QUANTITIES = {
     "slowness": "time per way",
     "sluggishness": "time per speed gained",
     "teeth": "ripples per turn",
+    "astray": "error on motions left out, times the noise",
 }
 SLIDING = {
     "rad": "m",
