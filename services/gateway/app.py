@@ -158,6 +158,8 @@ class _Guard:
             return problem(411, "a Content-Length is needed", Request(scope))
         if int(length) > BODY_LIMIT:
             return problem(413, f"more than {BODY_LIMIT} bytes", Request(scope))
+        if scope["path"] == "/login" and int(length) > pages.FORM_LIMIT:  # anybody may send it
+            return problem(413, f"more than {pages.FORM_LIMIT} bytes", Request(scope))
         reads = scope["path"].startswith("/v1/") and scope["method"] == "POST"
         if reads and asking(Request(scope)) is None:  # a body of a stranger is not even read
             return problem(401, UNKNOWN, Request(scope), **CHALLENGE)
@@ -270,7 +272,9 @@ async def resume_study(
 
 
 @v1.post(
-    "/studies/{study:name}/trials/{number:int}:release", response_model=TrialShape, responses=WRITE
+    "/studies/{study:name}/trials/{number:nth}:release",
+    response_model=TrialShape,
+    responses=WRITE,
 )
 async def release_trial(
     request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
@@ -282,7 +286,7 @@ async def release_trial(
 
 
 @v1.post(
-    "/studies/{study:name}/trials/{number:int}:retry", response_model=TrialShape, responses=WRITE
+    "/studies/{study:name}/trials/{number:nth}:retry", response_model=TrialShape, responses=WRITE
 )
 async def retry_trial(
     request: Request,
@@ -299,7 +303,7 @@ async def retry_trial(
 
 
 @v1.post(
-    "/studies/{study:name}/trials/{number:int}:cancel", response_model=TrialShape, responses=WRITE
+    "/studies/{study:name}/trials/{number:nth}:cancel", response_model=TrialShape, responses=WRITE
 )
 async def cancel_trial(
     request: Request, user: Operator, study: StudyName, number: Number, key: IdempotencyKey = None
@@ -309,7 +313,7 @@ async def cancel_trial(
 
 
 @v1.post(
-    "/studies/{study:name}/trials/{number:int}:void", response_model=TrialShape, responses=WRITE
+    "/studies/{study:name}/trials/{number:nth}:void", response_model=TrialShape, responses=WRITE
 )
 async def void_trial(
     request: Request,

@@ -27,6 +27,8 @@ Stamp = dict[str, tuple[int, int]]
 """When files were changed, in ns, and their sizes, by name."""
 
 SCHEMA = 1
+KEY = 40
+"""Characters of a CURVE key in z85."""
 
 
 class Role(IntEnum):
@@ -157,7 +159,7 @@ class KeyRing:
         """Tells whether the agents' keys changed."""
         found = {}
         for file in self.agents_folder.glob("*.key"):
-            with suppress(FileNotFoundError):
+            with suppress(OSError):  # one that is gone or cannot be read keeps nobody else out
                 status = file.stat()
                 found[file.name] = (status.st_mtime_ns, status.st_size)
         return found
@@ -236,4 +238,6 @@ def _pair(file: Path) -> tuple[bytes, bytes]:
         raise InputError(f"{file}: no CURVE key") from error
     if secret is None:
         raise InputError(f"{file}: holds no secret key")
+    if not len(public) == len(secret) == KEY:
+        raise InputError(f"{file}: no CURVE key; keys have {KEY} characters")
     return public, secret

@@ -1,4 +1,4 @@
-"""Names of studies, agents and tokens, in files and in paths."""
+"""Names of studies, agents and tokens, in files and in paths; numbers in paths."""
 
 import re
 
@@ -21,7 +21,20 @@ class _Name(Convertor[str]):
         return value
 
 
+class _Nth(Convertor[int]):
+    """The number of a trial: not one so long that Python would not read it."""
+
+    regex = "[0-9]{1,9}"
+
+    def convert(self, value: str) -> int:
+        return int(value)
+
+    def to_string(self, value: int) -> str:
+        return str(value)
+
+
 register_url_convertor("name", _Name())
+register_url_convertor("nth", _Nth())
 
 
 def is_name(text: str) -> bool:

@@ -16,6 +16,7 @@ from pup.errors import InputError
 from pup.transfer.trial import TrialError
 from services.gateway.conductor import UnknownError
 from services.gateway.dispatcher import NoJobsError
+from services.gateway.store import ReplacedError
 
 log = logging.getLogger(__name__)
 
@@ -90,6 +91,10 @@ def handle(app: FastAPI) -> None:
     @app.exception_handler(NoJobsError)
     async def of_jobs(request: Request, error: NoJobsError) -> JSONResponse:
         return problem(503, str(error), request)
+
+    @app.exception_handler(ReplacedError)
+    async def of_replaced(request: Request, error: ReplacedError) -> JSONResponse:
+        return problem(503, str(error), request, **{"Retry-After": "1"})
 
     @app.exception_handler(SQLAlchemyError)
     async def of_database(request: Request, error: SQLAlchemyError) -> JSONResponse:

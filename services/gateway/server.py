@@ -5,15 +5,20 @@ import contextlib
 import json
 import logging
 import signal
+import socket
 import ssl
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import uvicorn
+from sqlalchemy import make_url
+from sqlalchemy.exc import ArgumentError, OperationalError, SQLAlchemyError
 
 from pup.errors import InputError
+from services.failures import FailedError
 from services.gateway.app import application
 from services.gateway.conductor import Conductor
 from services.gateway.config import Config
@@ -24,7 +29,8 @@ from services.gateway.link import Link
 from services.gateway.metrics import Metrics
 from services.gateway.ray_jobs import RayJobs
 from services.gateway.recordings import Shelves
-from services.gateway.store import ReplacedError, Store
+from services.gateway.sockets import Impatient, check_link, web_socket
+from services.gateway.store import ReplacedError, Store, may_pass
 
 log = logging.getLogger(__name__)
 STANDARD = set(vars(logging.makeLogRecord({}))) | {"message", "taskName"}
@@ -58,6 +64,7 @@ def serve(config: Config) -> dict[str, Any]:
       FailedError: the database does not answer now.
     """
     _check_certificate(config)
+    _check_kept(config.url)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     logging.basicConfig(level=config.log.upper(), handlers=[handler], force=True)
@@ -84,7 +91,18 @@ def _check_certificate(config: Config) -> None:
         raise InputError(f"certificate {config.certificate}, key {config.key}: {why}") from error
 
 
+def _check_kept(url: str) -> None:
+    """Refuse a database in memory: it is another one in each thread, and gone at a restart."""
+    with contextlib.suppress(ArgumentError):  # told where it is opened
+        place = make_url(url)
+        if place.get_backend_name() == "sqlite" and place.database in (None, "", ":memory:"):
+            like = "sqlite:////var/lib/pup/gateway.db"
+            raise InputError(f"database: {url} keeps nothing; name a file, as in {like}")
+
+
 async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
+    web = web_socket(config.host, config.port)
+    check_link(config.link)  # before the database: it would be taken from a gateway that runs
     ray = RayJobs(config.ray, config.ray_token) if config.ray else None
     store, fits, metrics = Store(config.url), Fits(), Metrics()
     conductor = Conductor(store, fits, metrics)
@@ -99,15 +117,13 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
     )
     link = Link(config, ring, conductor)
     try:
-        await conductor.load()
-        await dispatcher.load()
+        await _load(conductor, dispatcher)
         link.start()
         app = application(store, tokens, conductor, dispatcher, link, Shelves(config.shelves))
         server = _Server(
             uvicorn.Config(
                 app,
-                config.host,
-                config.port,
+                http=Impatient,
                 log_config=None,
                 access_log=False,
                 server_header=False,
@@ -117,10 +133,11 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
                 limit_concurrency=1000,
             )
         )
-        await _until_stopped(config, conductor, dispatcher, link, server)
+        await _until_stopped(config, conductor, dispatcher, link, server, web)
     except ReplacedError as error:
         raise InputError(str(error)) from error
     finally:
+        web.close()
         if ray is not None:
             await ray.close()
         link.close()
@@ -131,8 +148,30 @@ async def _run(config: Config, tokens: Tokens, ring: KeyRing) -> dict[str, Any]:
     return {"stopped": True}
 
 
+async def _load(conductor: Conductor, dispatcher: Dispatcher) -> None:
+    """Read what the database holds.
+
+    Raises:
+      InputError: it is damaged.
+      FailedError: it does not answer now.
+    """
+    try:
+        await conductor.load()
+        await dispatcher.load()
+    except (SQLAlchemyError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+        place = (str(error) or type(error).__name__).splitlines()[0]
+        if isinstance(error, OperationalError) and may_pass(error):
+            raise FailedError(f"database: does not answer now ({place})") from error
+        raise InputError(f"database: is damaged; restore a backup ({place})") from error
+
+
 async def _until_stopped(
-    config: Config, conductor: Conductor, dispatcher: Dispatcher, link: Link, server: "_Server"
+    config: Config,
+    conductor: Conductor,
+    dispatcher: Dispatcher,
+    link: Link,
+    server: "_Server",
+    web: socket.socket,
 ) -> None:
     works = [
         asyncio.create_task(act(), name=name)
@@ -141,7 +180,7 @@ async def _until_stopped(
             ("jobs", dispatcher.run),
             ("link", link.run),
             ("keys", link.watch),
-            ("web", server.serve),
+            ("web", partial(server.serve, [web])),
         )
     ]
     warm = asyncio.create_task(conductor.fits.warm_up())
@@ -162,7 +201,7 @@ async def _until_stopped(
 
 
 class _Server(uvicorn.Server):
-    """Uvicorn without signal handlers of its own, which says what it cannot bind."""
+    """Uvicorn without signal handlers of its own."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Any:
@@ -173,17 +212,3 @@ class _Server(uvicorn.Server):
         """Take no more requests and end streams."""
         self.config.app.state.stopping = True  # type: ignore[union-attr]  # it is no name of one
         self.should_exit = True
-
-    async def startup(self, sockets: Any = None) -> None:
-        """Bind.
-
-        Raises:
-          InputError: the address cannot be had.
-        """
-        try:
-            await super().startup(sockets)
-        except SystemExit as error:  # uvicorn ends so
-            place = f"{self.config.host}:{self.config.port}"
-            raise InputError(
-                f"web: {place} cannot be bound; is another gateway running?"
-            ) from error

@@ -118,7 +118,7 @@ class Store:
             raise InputError(f"database: a newer program wrote it ({error})") from error
         except (SQLAlchemyError, ModuleNotFoundError) as error:
             place = str(error).splitlines()[0]
-            if isinstance(error, OperationalError) and _may_pass(error):
+            if isinstance(error, OperationalError) and may_pass(error):
                 raise FailedError(f"database: does not answer now ({place})") from error
             raise InputError(f"database: cannot be opened ({place})") from error
 
@@ -295,7 +295,7 @@ def engine_options(url: str) -> dict[str, Any]:
     return {"pool_pre_ping": True, "connect_args": waits}
 
 
-def _may_pass(error: OperationalError) -> bool:
+def may_pass(error: OperationalError) -> bool:
     """Whether trying again may help: a server may be late, a wrong path stays wrong."""
     code = getattr(error.orig, "sqlite_errorcode", None)
     return code is None or code & 0xFF in PASSING  # the low byte of an extended code is its kind
