@@ -14,16 +14,19 @@ that was given up is shut out: its process reads in order.json that another one 
 
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin
 
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
 
+T = TypeVar("T")
+
 SCHEMA = 1
 JOBS = "jobs"
 ORDER = "order.json"
+BEAT = "beat.json"
 REVOKED = 75
 """Exit code of a process whose attempt is another's, or was called off before it began."""
 
@@ -65,6 +68,19 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Beat:
+    """A sign of life.
+
+    Attributes:
+      attempt: that lives.
+      count: of its signs so far.
+    """
+
+    attempt: int
+    count: int
+
+
+@dataclass(frozen=True)
 class JobFolder:
     """A job's folder.
 
@@ -99,7 +115,7 @@ class JobFolder:
         Raises:
           InputError: the file is absent or no order.
         """
-        return Order(**_read(self.path / ORDER))
+        return _read(self.path / ORDER, Order)
 
     def revoke(self) -> None:
         """Have what runs stop, and nothing begin.
@@ -131,15 +147,15 @@ class JobFolder:
 
     def beat(self, attempt: int, count: int) -> None:
         """Give a sign of life."""
-        write_json(self.path / "beat.json", {"schema": SCHEMA, "attempt": attempt, "count": count})
+        write_json(self.path / BEAT, {"schema": SCHEMA} | asdict(Beat(attempt, count)))
 
     def heard(self) -> tuple[int, int] | None:
         """Attempt and count of the last sign of life."""
         try:
-            told = _read(self.path / "beat.json")
+            beat = _read(self.path / BEAT, Beat)
         except InputError:
             return None
-        return told["attempt"], told["count"]
+        return beat.attempt, beat.count
 
     def write_outcome(self, outcome: Outcome) -> None:
         """Keep how an attempt ended."""
@@ -148,7 +164,7 @@ class JobFolder:
     def outcome(self, attempt: int) -> Outcome | None:
         """How an attempt ended; None while nothing is known."""
         try:
-            return Outcome(**_read(self._outcome(attempt)))
+            return _read(self._outcome(attempt), Outcome)
         except InputError:
             return None
 
@@ -222,8 +238,28 @@ def inside(folder: Path, name: str) -> Path | None:
     return path if there and not parts[-1].startswith(".") else None
 
 
-def _read(path: Path) -> dict[str, Any]:
-    told = read_json(path)
-    if not isinstance(told, dict) or told.pop("schema", None) != SCHEMA:
+def _read(path: Path, kind: type[T]) -> T:
+    """The data class that a file holds; what a newer program added to it is left out.
+
+    Raises:
+      InputError: the file is absent or holds something else.
+    """
+    told, known = read_json(path), {}
+    if not isinstance(told, dict) or told.get("schema") != SCHEMA:
         raise InputError(f"{path}: not of schema {SCHEMA}")
-    return told
+    for f in fields(kind):  # type: ignore[arg-type]  # no type says that it is a data class
+        if f.name in told:
+            if not _is(f.type, told[f.name]):
+                raise InputError(f"{path}: {f.name} is of another type")
+            known[f.name] = told[f.name]
+        elif f.default is MISSING and f.default_factory is MISSING:
+            raise InputError(f"{path}: {f.name} is missing")
+    return kind(**known)
+
+
+def _is(kind: Any, value: Any) -> bool:
+    """Whether a JSON value is of a type, such as `dict[str, str]`; True is no whole number."""
+    if type(value) is not (get_origin(kind) or kind):
+        return False
+    entries = value.values() if isinstance(value, dict) else value if get_args(kind) else ()
+    return all(_is(get_args(kind)[-1], entry) for entry in entries)

@@ -7,6 +7,7 @@ from codecs import getincrementaldecoder
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 
@@ -97,12 +98,12 @@ def _fetch(gateway: Gateway, options: argparse.Namespace) -> dict[str, Any]:
     if missing := [name for name in options.names if name not in known]:
         raise InputError(f"{options.job} has no artefact {missing[0]}")
     wanted = [a for a in listed if not options.names or a["name"] in options.names]
-    files = [_download(gateway, f"{place}/{a['name']}", a, options.out) for a in wanted]
+    files = [_download(gateway, place, a, options.out) for a in wanted]
     return {"files": [str(file) for file in files]}
 
 
 def _download(gateway: Gateway, place: str, artifact: dict[str, Any], out: Path) -> Path:
-    """Fetch a file whole, unless it lies there already."""
+    """Fetch a file of the list at a place whole, unless it lies there already."""
     name, digest = str(artifact["name"]), artifact["sha256"]
     path = out / name
     if not path.resolve().is_relative_to(out.resolve()):
@@ -111,8 +112,9 @@ def _download(gateway: Gateway, place: str, artifact: dict[str, Any], out: Path)
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
+    at = f"{place}/{quote(name)}"  # as it is, a name with # or ? would end there
     try:
-        with gateway.http.stream("GET", place) as answer, open(part, "wb") as file:
+        with gateway.http.stream("GET", at) as answer, open(part, "wb") as file:
             if answer.status_code != 200:
                 raise InputError(f"{gateway.url}: {name}: it answers {answer.status_code}")
             for chunk in answer.iter_bytes():

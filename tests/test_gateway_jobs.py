@@ -225,6 +225,18 @@ def test_no_artefact_is_left_out_of_what_is_fetched(service, many, where, tmp_pa
     assert set(files(tmp_path)) == {"presysid/bounds.json"}
 
 
+def test_artefacts_are_fetched_whatever_their_names(service, where, tmp_path):
+    names = {"a#1.json", "b?x=2.json", "c%41.json", "d e/f#&;=+@:~.json", "ü.json", "z.json"}
+    for name in names:
+        file = shared(service) / "jobs" / "job-failed" / "out" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(name)
+    done = pup("jobs", "fetch", "job-failed", "--out", tmp_path, *where)
+    assert done.code == 0, done.err
+    assert set(files(tmp_path)) == names
+    assert all((tmp_path / name).read_text() == name for name in names)
+
+
 def test_the_page_of_a_job_shows_some_of_many_files(service, many):
     cookies = {"pup_token": service.tokens["viewer"]}
     shown = httpx.get(f"{service.url}/jobs/{many}", cookies=cookies).text

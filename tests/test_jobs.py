@@ -1,5 +1,6 @@
 """Jobs without a cluster: what may be one, how one goes on, its process, its folder."""
 
+import json
 import os
 import signal
 import subprocess
@@ -329,3 +330,60 @@ def test_the_tail_of_a_log_begins_with_a_line(tmp_path):
     folder.log.write_bytes("first\nsecönd\nthird\n".encode())
     assert folder.tail(10) == "third\n" and folder.last_line() == "third"
     assert folder.tail(10**6).startswith("first")
+
+
+FILES = {
+    "order.json": {"job": "j", "attempt": 1, "stop": False, "fresh": True, "command": ["replay"]},
+    "beat.json": {"attempt": 1, "count": 7},
+    "outcome-1.json": {"attempt": 1, "exit": 0, "told": "done", "artifacts": {"a": "5e"}},
+}
+
+
+def filled(path, **changed):
+    """A folder with a file of each kind; a change of a field goes to all files that have it."""
+    for name, told in FILES.items():
+        told = {"schema": 1} | told | {k: v for k, v in changed.items() if k in told or k == "new"}
+        (path / name).write_text(json.dumps({k: v for k, v in told.items() if v is not ...}))
+    return JobFolder(path)
+
+
+@pytest.mark.parametrize("changed", [{}, {"new": {"of": "a newer program"}}])
+def test_what_a_newer_program_adds_to_the_files_of_a_job_is_left_out(tmp_path, changed):
+    folder = filled(tmp_path, **changed)
+    assert folder.order() == Order(**FILES["order.json"])
+    assert folder.heard() == (1, 7)
+    assert folder.outcome(1) == Outcome(**FILES["outcome-1.json"])
+
+
+@pytest.mark.parametrize("wrong", [..., None, "1", 1.0, True, [1], {"a": 1}])
+def test_files_of_a_job_of_another_shape_are_as_good_as_unreadable(tmp_path, wrong):
+    folder = filled(tmp_path, attempt=wrong)
+    assert folder.outcome(1) is None and folder.heard() is None
+    with pytest.raises(InputError, match=r"order.json: attempt is "):
+        folder.order()
+    with pytest.raises(OSError, match=r"order.json: attempt is "):  # it may hold a process
+        folder.revoke()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"artifacts": {"a": 1}}, {"artifacts": ["a"]}, {"told": None}, {"exit": False}, {"exit": ...}],
+)
+def test_an_outcome_holds_what_is_read_of_it(tmp_path, changed):
+    assert filled(tmp_path, **changed).outcome(1) is None
+
+
+@pytest.mark.parametrize("changed", [{"command": "replay"}, {"command": ["a", 1]}, {"stop": 0}])
+def test_an_order_holds_what_is_read_of_it(tmp_path, changed):
+    with pytest.raises(InputError, match="is of another type"):
+        filled(tmp_path, **changed).order()
+
+
+@pytest.mark.parametrize("text", ["[]", "1", "null", "{}", '{"schema": 2}', '{"schema": []}'])
+def test_json_that_is_no_file_of_a_job_is_refused(tmp_path, text):
+    for name in FILES:
+        (tmp_path / name).write_text(text)
+    folder = JobFolder(tmp_path)
+    assert folder.outcome(1) is None and folder.heard() is None
+    with pytest.raises(InputError, match="not of schema 1"):
+        folder.order()

@@ -35,6 +35,7 @@ class Ray:
         self.asked: list[str] = []
         self.stopped: list[str] = []
         self.full = set[str]()  # submissions that Ray has given up
+        self.done = set[str]()
 
     async def check(self) -> None:
         """It is there."""
@@ -48,6 +49,8 @@ class Ray:
     async def seen(self, submission: str) -> Seen:
         if submission in self.full:
             return Seen(Status.FAILED, unstarted=True)
+        if submission in self.done:
+            return Seen(Status.SUCCEEDED)
         return Seen(Status.PENDING if submission in self.asked else Status.UNKNOWN)
 
 
@@ -206,6 +209,26 @@ def test_a_job_whose_folder_was_removed_can_be_called_off(store: Store, tmp_path
             await jobs.tick()
         shutil.rmtree(jobs.folder(name).path)
         assert (await jobs.cancel(name, "ann")).state is JobState.CANCELLED
+
+    asyncio.run(told())
+
+
+def test_an_outcome_of_another_shape_holds_no_job_up(store: Store, tmp_path: Path) -> None:
+    async def told() -> None:
+        ray = Ray()
+        jobs = Dispatcher(store, ray, tmp_path, Metrics(), lambda _: None)
+        name = (await jobs.submit(job(), None))[0].id
+        for _ in range(2):
+            await jobs.tick()
+        folder = jobs.folder(name)
+        (folder.path / "outcome-1.json").write_text('{"schema": 1, "exit": "none"}')
+        folder.out.mkdir()
+        (folder.out / "a").touch()
+        ray.done.add(f"{name}-1")
+        await jobs.tick()
+        assert jobs.job(name).state is JobState.SUCCEEDED  # as Ray says
+        listed, _ = await artifacts(jobs, jobs.job(name))
+        assert [(row["name"], row["sha256"]) for row in listed] == [("a", None)]
 
     asyncio.run(told())
 

@@ -13,8 +13,8 @@ import secrets
 import shlex
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pup.errors import InputError
@@ -38,10 +38,25 @@ OPEN_LIMIT = 1000
 """Jobs that may be under way or wait."""
 LIST = "jobs/"
 """What those are told by who wait for any job to change; no study has this name."""
+NO_CLUSTER = "this service has no Ray cluster; set ray and shared"
+NO_STORAGE = "the shared storage is not set, so no file of a job can be read; set ray and shared"
+NOWHERE = Path("/nonexistent")
+"""The shared storage where none is set: an empty path would be the working directory."""
 
 
 class NoJobsError(RuntimeError):
     """The service has no cluster, or cannot reach what jobs need."""
+
+
+@dataclass(frozen=True)
+class _NoFolder(JobFolder):
+    """A job's folder where no shared storage is set: its files are not gone, but out of sight."""
+
+    def files(self) -> Iterator[tuple[str, Path]]:
+        raise NoJobsError(NO_STORAGE)
+
+    def file(self, name: str) -> Path | None:
+        raise NoJobsError(NO_STORAGE)
 
 
 class Dispatcher:
@@ -49,8 +64,8 @@ class Dispatcher:
 
     Args:
       store: what must not be forgotten.
-      ray: the cluster; None where there are no jobs.
-      shared: root of the shared storage.
+      ray: the cluster; None where none is set, and jobs of earlier days are left as they are.
+      shared: root of the shared storage, which nothing is read from without a cluster.
       metrics: counts.
       notify: tells whoever waits that a job changed.
       at_once: jobs that Ray is asked for together; see Config.
@@ -67,7 +82,8 @@ class Dispatcher:
         at_once: int = 1,
         cores: int = 0,
     ) -> None:
-        self.store, self.ray, self.shared = store, ray, shared
+        self.store, self.ray = store, ray
+        self.shared = NOWHERE if ray is None else shared
         self.metrics, self.notify = metrics, notify
         self.at_once, self.cores = at_once, cores
         self.jobs: dict[str, Job] = {}
@@ -97,6 +113,8 @@ class Dispatcher:
     async def tick(self) -> None:
         """Look once at all jobs under way."""
         if self.ray is None:
+            waits = any(job.open for job in self.jobs.values())
+            self._say("a cluster: set ray and shared" if waits else "")
             return
         self._away = self._failed = ""
         try:
@@ -139,8 +157,9 @@ class Dispatcher:
         return self.jobs[name]
 
     def folder(self, name: str) -> JobFolder:
-        """The folder of a job."""
-        return folder_of(self.shared, self.job(name).id)
+        """The folder of a job; one that refuses to be read where no shared storage is set."""
+        folder = folder_of(self.shared, self.job(name).id)
+        return _NoFolder(folder.path) if self.ray is None else folder
 
     async def submit(self, wanted: Job, key: str | None) -> tuple[Job, bool]:
         """Take on a job; one that was submitted with the same key is found again.
@@ -157,8 +176,7 @@ class Dispatcher:
           InputError: the verb would refuse the arguments.
           TrialError: the key had another job.
         """
-        if self.ray is None:
-            raise NoJobsError("this service has no Ray cluster; set ray and shared")
+        self._check_cluster()
         job = _named(wanted, key)
         async with self._locks[job.id]:
             if before := self.jobs.get(job.id):
@@ -181,8 +199,10 @@ class Dispatcher:
 
         Raises:
           TrialError: it has ended.
-          NoJobsError: its process is yet to be told, as soon as the shared storage takes files.
+          NoJobsError: there is no cluster, and nothing was done; or its process is yet to be told,
+            as soon as the shared storage takes files.
         """
+        self._check_cluster()
         async with self._locks[name]:
             job = self.job(name)
             if not job.open:
@@ -198,7 +218,13 @@ class Dispatcher:
         return self.job(name)
 
     async def retry(self, name: str, attempt: int, who: str) -> Job:
-        """Attempt a job again that ended without a result; it resumes."""
+        """Attempt a job again that ended without a result; it resumes.
+
+        Raises:
+          NoJobsError: there is no cluster.
+          TrialError: it goes on, is done, or has another number of attempts.
+        """
+        self._check_cluster()
         async with self._locks[name]:
             job = self.job(name)
             if job.open or job.state is JobState.SUCCEEDED:
@@ -306,6 +332,10 @@ class Dispatcher:
         if self._sizes.get(job.id) != size:
             self._sizes[job.id] = size
             self.notify(LIST + job.id)
+
+    def _check_cluster(self) -> None:
+        if self.ray is None:
+            raise NoJobsError(NO_CLUSTER)
 
     def _check(self, job: Job) -> None:
         """Refuse what the verb would refuse, and what finds no room on a cluster of fixed size."""

@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 from services.gateway import names
 from services.gateway.access import IdempotencyKey, IdempotentRoute, asking, needs
 from services.gateway.answers import as_json, stream
-from services.gateway.dispatcher import LIST, Dispatcher
+from services.gateway.dispatcher import LIST, NO_STORAGE, Dispatcher, NoJobsError
 from services.gateway.jobs import Job, JobState
 from services.gateway.keys import Role, User
 from services.gateway.problems import responses
@@ -34,6 +34,7 @@ JobName = Annotated[str, Path(pattern=names.WHOLE, description="Id of a job.")]
 Viewer = Annotated[User, needs(Role.VIEWER)]
 Operator = Annotated[User, needs(Role.OPERATOR)]
 READ = responses(400, 401, 403, 404, 422)
+FILES = responses(400, 401, 403, 404, 422, 503)
 WRITE = responses(400, 401, 403, 404, 409, 411, 413, 422, 503)
 router = APIRouter(prefix="/v1", route_class=IdempotentRoute)
 
@@ -208,7 +209,7 @@ async def retry_job(
 
 @router.get(
     "/jobs/{job:name}/logs",
-    responses=READ | {200: {"content": {"text/plain": {}}}},
+    responses=FILES | {200: {"content": {"text/plain": {}}}},
     response_class=PlainTextResponse,
 )
 async def get_logs(
@@ -221,6 +222,8 @@ async def get_logs(
     """What a job said, in all its attempts, from a byte on."""
     dispatcher = dispatcher_of(request)
     dispatcher.job(job)
+    if dispatcher.ray is None:  # an answer that has begun can say so no more
+        raise NoJobsError(NO_STORAGE)
 
     async def told() -> AsyncIterator[bytes]:
         at, path = offset, dispatcher.folder(job).log
@@ -236,7 +239,7 @@ async def get_logs(
     return StreamingResponse(told(), media_type="text/plain; charset=utf-8")
 
 
-@router.get("/jobs/{job:name}/artifacts", response_model=ArtifactList, responses=READ)
+@router.get("/jobs/{job:name}/artifacts", response_model=ArtifactList, responses=FILES)
 async def list_artifacts(
     request: Request,
     _: Viewer,
@@ -254,7 +257,7 @@ async def list_artifacts(
 
 @router.get(
     "/jobs/{job:name}/artifacts/{name:path}",
-    responses=READ | {200: {"content": {"application/octet-stream": {}}}},
+    responses=FILES | {200: {"content": {"application/octet-stream": {}}}},
     response_class=FileResponse,
 )
 async def get_artifact(request: Request, _: Viewer, job: JobName, name: str) -> Response:

@@ -13,6 +13,7 @@ from services.gateway import drawing, job_routes, names  # noqa: F401 - names ma
 from services.gateway.access import COOKIE, asking
 from services.gateway.artefacts import ways
 from services.gateway.conductor import Conductor
+from services.gateway.dispatcher import NoJobsError
 from services.gateway.html import login, page, part
 from services.gateway.keys import Tokens
 from services.gateway.posteriors import NOTHING
@@ -135,7 +136,10 @@ async def one_job(request: Request, job: str) -> Response:
         return login()
     dispatcher = job_routes.dispatcher_of(request)
     found = dispatcher.job(job)
-    files, more = await job_routes.artifacts(dispatcher, found, ARTIFACTS)
+    try:
+        files, more = await job_routes.artifacts(dispatcher, found, ARTIFACTS)
+    except NoJobsError:  # the page says what the job waits for
+        files, more = [], None
     name = part(request, "job.html", "job_live.html")
     return page(
         name,
