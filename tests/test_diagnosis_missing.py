@@ -16,6 +16,7 @@ from pup.diagnosis.lawfit import Law
 from pup.diagnosis.report_missing import LASTS, clearest
 from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.sentences import items, sentence
+from pup.diagnosis.verdict import Parameter
 from pup.diagnosis.wording import percent
 from pup.physics.terms import Place
 from pup.robot import RobotDescription
@@ -174,6 +175,15 @@ def test_a_nameless_cause_has_a_place(leg: Maker, place: Place, where: str) -> N
     told = leg.beyond(leg.nothing(2.0), place, None)
     assert sentence(told, told.findings[0], speech(told)) == f"{NAMELESS} {where}."
     assert items(told, speech(told))[0].text == f"{NAMELESS} {where}."
+
+
+def test_a_nameless_cause_that_names_are_patches_for_says_so(leg: Maker) -> None:
+    told = leg.beyond(leg.nothing(2.0), KNEE, None)
+    patched = replace(told.findings[0], parameters={"astray": Parameter(2.14, "1", 2.14, 2.14)})
+    assert sentence(told, patched, speech(told)) == (
+        f"{NAMELESS} at the left knee: the effects that are told of may be patches for it, and "
+        "leave 2.1 times the noise on motions that were left out."
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
