@@ -34,6 +34,10 @@ def serve(place: Place, config: str, *options: object) -> list[object]:
     return ["serve", *options, "--config", place.write("gateway.toml", config)]
 
 
+ANYWHERE = 'data = "service"\nport = 0\nlink = "tcp://127.0.0.1:*"\nlog = "error"\n'
+"""Of a gateway that listens before it is refused, as another test's may at the same time."""
+
+
 def bundle(place: Place) -> Path:
     return agents.bundle(place.here / "policy")
 
@@ -140,7 +144,7 @@ def _(place: Place) -> Made:
 
 @case("a database that is none")
 def _(place: Place) -> Made:
-    return serve(place, 'data = "service"\ndatabase = "nosuch://x"\nlog = "error"'), (
+    return serve(place, ANYWHERE + 'database = "nosuch://x"'), (
         "database",
         "nosuch",
     )
@@ -149,7 +153,7 @@ def _(place: Place) -> Made:
 @case("a database in a folder that is not there")
 def _(place: Place) -> Made:
     file = place.here / "none" / "gateway.db"
-    return serve(place, f'data = "service"\ndatabase = "sqlite:///{file}"\nlog = "error"'), (
+    return serve(place, ANYWHERE + f'database = "sqlite:///{file}"'), (
         "database",
         "unable to open",
     )

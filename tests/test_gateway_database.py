@@ -47,6 +47,8 @@ def test_a_database_that_does_not_answer_yet_is_no_bad_input(
     monkeypatch.setenv("PUP_DATA", str(tmp_path))
     monkeypatch.setenv("PUP_DATABASE", f"sqlite:///{file}?timeout=0.1")
     monkeypatch.setenv("PUP_LOG", "error")
+    monkeypatch.setenv("PUP_PORT", "0")  # it listens first, as another test's may do now
+    monkeypatch.setenv("PUP_LINK", "tcp://127.0.0.1:*")
     with closing(locked(file)):
         done = pup("serve")
     assert done.code == 1

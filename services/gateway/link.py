@@ -15,7 +15,6 @@ import zmq
 import zmq.asyncio
 from zmq.auth.asyncio import AsyncioAuthenticator
 
-from pup.errors import InputError
 from pup.files import sha256, write_atomic
 from pup.wire import (
     CHUNK,
@@ -39,6 +38,7 @@ from services.gateway.agents import AgentView
 from services.gateway.conductor import Conductor
 from services.gateway.config import Config
 from services.gateway.keys import KeyRing, Stamp
+from services.gateway.sockets import bind_link
 
 log = logging.getLogger(__name__)
 
@@ -93,10 +93,7 @@ class Link:
         socket.sndhwm = socket.rcvhwm = QUEUE
         socket.handshake_ivl = 5000
         socket.heartbeat_ivl, socket.heartbeat_timeout, socket.heartbeat_ttl = 1000, 5000, 5000
-        try:
-            socket.bind(self.config.link)
-        except zmq.ZMQError as error:
-            raise InputError(f"link: {self.config.link} cannot be bound ({error})") from error
+        bind_link(socket, self.config.link)
         self.bound = True
         self.conductor.courier.send = self.send
 

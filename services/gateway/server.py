@@ -15,10 +15,9 @@ from typing import Any
 
 import uvicorn
 from sqlalchemy import make_url
-from sqlalchemy.exc import ArgumentError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from pup.errors import InputError
-from services.failures import FailedError
 from services.gateway.app import application
 from services.gateway.conductor import Conductor
 from services.gateway.config import Config
@@ -30,7 +29,7 @@ from services.gateway.metrics import Metrics
 from services.gateway.ray_jobs import RayJobs
 from services.gateway.recordings import Shelves
 from services.gateway.sockets import Impatient, check_link, web_socket
-from services.gateway.store import ReplacedError, Store, may_pass
+from services.gateway.store import ReplacedError, Store, refusal
 
 log = logging.getLogger(__name__)
 STANDARD = set(vars(logging.makeLogRecord({}))) | {"message", "taskName"}
@@ -159,10 +158,7 @@ async def _load(conductor: Conductor, dispatcher: Dispatcher) -> None:
         await conductor.load()
         await dispatcher.load()
     except (SQLAlchemyError, ArithmeticError, LookupError, TypeError, ValueError) as error:
-        place = (str(error) or type(error).__name__).splitlines()[0]
-        if isinstance(error, OperationalError) and may_pass(error):
-            raise FailedError(f"database: does not answer now ({place})") from error
-        raise InputError(f"database: is damaged; restore a backup ({place})") from error
+        raise refusal(error, "is damaged; restore a backup") from error
 
 
 async def _until_stopped(

@@ -33,10 +33,19 @@ def check_link(address: str) -> None:
       InputError: the address cannot be had.
     """
     with zmq.Context() as context, context.socket(zmq.ROUTER) as trial:
-        try:
-            trial.bind(address)
-        except zmq.ZMQError as error:
-            raise InputError(f"link: {address} cannot be bound ({error})") from error
+        bind_link(trial, address)
+
+
+def bind_link(router: zmq.Socket[bytes], address: str) -> None:
+    """Bind a socket to the link's address.
+
+    Raises:
+      InputError: the address cannot be had.
+    """
+    try:
+        router.bind(address)
+    except zmq.ZMQError as error:
+        raise InputError(f"link: {address} cannot be bound ({error})") from error
 
 
 class Impatient(AutoHTTPProtocol):  # type: ignore[misc, valid-type]  # chosen as uvicorn starts

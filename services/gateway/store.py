@@ -117,10 +117,7 @@ class Store:
         except CommandError as error:
             raise InputError(f"database: a newer program wrote it ({error})") from error
         except (SQLAlchemyError, ModuleNotFoundError) as error:
-            place = str(error).splitlines()[0]
-            if isinstance(error, OperationalError) and may_pass(error):
-                raise FailedError(f"database: does not answer now ({place})") from error
-            raise InputError(f"database: cannot be opened ({place})") from error
+            raise refusal(error, "cannot be opened") from error
 
     async def run(self, act: Callable[[sa.Connection], T]) -> T:
         """Run a transaction in the store's thread."""
@@ -295,7 +292,20 @@ def engine_options(url: str) -> dict[str, Any]:
     return {"pool_pre_ping": True, "connect_args": waits}
 
 
-def may_pass(error: OperationalError) -> bool:
+def refusal(error: Exception, otherwise: str) -> InputError | FailedError:
+    """What is told of an error of the database in a line.
+
+    Args:
+      error: as it came.
+      otherwise: what is the matter where trying again does not help.
+    """
+    place = (str(error) or type(error).__name__).splitlines()[0]
+    if isinstance(error, OperationalError) and _may_pass(error):
+        return FailedError(f"database: does not answer now ({place})")
+    return InputError(f"database: {otherwise} ({place})")
+
+
+def _may_pass(error: OperationalError) -> bool:
     """Whether trying again may help: a server may be late, a wrong path stays wrong."""
     code = getattr(error.orig, "sqlite_errorcode", None)
     return code is None or code & 0xFF in PASSING  # the low byte of an extended code is its kind
