@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import write_atomic
-from pup.recording_file import KEY, read_columns
+from pup.recording_file import KEY, read_columns, visible
 from pup.recording_rules import (
     SCHEMA,
     check_extra,
@@ -253,13 +253,16 @@ def from_columns(metadata: object, columns: Mapping[str, Array]) -> Recording:
 
 def _in_folder(folder: Path) -> list[Path]:
     """Recordings of a folder; those of its own folders are not left out in silence."""
-    found = sorted(folder.glob("*.parquet"))
-    if found and (other := next(folder.glob("*/*.parquet"), None)):
+    found = visible(folder, "*.parquet")
+    if found and (others := visible(folder, "*/*.parquet")):
         raise InputError(
-            f"{folder}: {other.parent.name} in it holds recordings too; move them up, or elsewhere"
+            f"{folder}: {others[0].parent.name} in it holds recordings too; move them up, or "
+            "elsewhere"
         )
-    if not found and (other := next(folder.rglob("*.parquet"), None)):
-        raise InputError(f"{folder}: no *.parquet in this folder, but in {other.parent}; name that")
+    if not found and (others := visible(folder, "**/*.parquet")):
+        raise InputError(
+            f"{folder}: no *.parquet in this folder, but in {others[0].parent}; name that"
+        )
     if not found:
         raise InputError(f"{folder}: no *.parquet in this folder; see `pup import`")
     return found
@@ -293,6 +296,8 @@ def load_recordings(
             except InputError as error:
                 raise InputError(f"{file}: {error}") from error
         if recording.id in origin:
+            if file.resolve() == origin[recording.id].resolve():
+                raise InputError(f"{file}: is given twice; name it once")
             raise InputError(
                 f"{file}: id {recording.id!r} is also that of {origin[recording.id]}; "
                 "every recording needs its own"

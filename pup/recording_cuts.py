@@ -84,11 +84,17 @@ def thinned(recording: Recording, every: int) -> Recording:
 
     Args:
       recording: the whole.
-      every: keep the first reading, and each so many rows another.
+      every: keep the first row with a reading, and each so many of them another. Rows of commands
+        alone, as a log has that tells both at times of their own, do not count.
+
+    Raises:
+      InputError: `every` is less than 1.
     """
+    if every < 1:
+        raise InputError(f"one in {every} readings: there is no such share; give 1 or more")
     position = recording.position.copy()
-    dropped = np.arange(len(position)) % every != 0
-    position[dropped] = np.nan
+    read = np.flatnonzero(~np.isnan(position).all(axis=1))
+    position[np.delete(read, np.s_[::every])] = np.nan
     return replace(recording, position=position)
 
 

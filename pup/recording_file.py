@@ -1,6 +1,7 @@
 """The Parquet file behind a recording: its footer is judged before any data is read."""
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -77,6 +78,20 @@ def read_header(path: Path) -> Header:
     return Header(metadata, joints, names, len(time), duration, rate)
 
 
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """Files of a folder by a pattern, sorted, without hidden ones and those in hidden folders.
+
+    What a killed writer left is hidden, and so is what macOS puts beside each file on a stick.
+
+    Raises:
+      InputError: the folder cannot be read, which `glob` takes for an empty one.
+    """
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be read; change its rights")
+    found = sorted(folder.glob(pattern))
+    return [f for f in found if not any(p.startswith(".") for p in f.relative_to(folder).parts)]
+
+
 def read_columns(path: Path) -> tuple[object, dict[str, Array]]:
     """Metadata and columns of a file, nulls as NaN.
 
@@ -101,11 +116,14 @@ def _opened(path: Path) -> Iterator[Any]:
     if size > MAX_FILE:
         raise InputError(f"{size} bytes; a recording has at most {MAX_FILE}")
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        # Opened here, as pyarrow knows no path whose name is not UTF-8.
+        with path.open("rb") as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
             _check_footer(file)
             yield file
     except InputError:
         raise
+    except MISTAKES as error:
+        raise InputError(f"cannot be read ({error.strerror})") from error
     except Exception as error:  # damaged files make pyarrow raise nearly anything
         told = " ".join(str(error).split())[:200]
         raise InputError(f"not a readable Parquet file ({told})") from error

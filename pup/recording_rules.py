@@ -22,6 +22,8 @@ PER_JOINT = ("target", "position", "velocity", "current", "load", "temperature")
 IMU = tuple(f"imu/{sensor}_{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
 WHOLE = ("voltage", "torque_enabled", "imu/roll", "imu/pitch", "imu/yaw", *IMU)
 
+MAX_ID, MAX_ID_BYTES = 120, 230
+"""Longest id; file systems let a name have 255 bytes, and a file on its way to it has a longer."""
 MAX_DURATION = 86_400.0  # s; longer means other units or a clock that jumped
 MAX_TICK = 0.5  # s; no servo is driven as slowly, but a clock in ms looks so
 BEYOND, MARGIN = 4.0, 2.0
@@ -67,8 +69,11 @@ def check_id(name: str) -> None:
     """Check an id: it becomes a file name, so nothing in it may lead out of the folder."""
     if not name.isprintable() or "/" in name or "\\" in name:
         raise InputError(f"metadata 'id' {name!r} holds a slash or a control character")
-    if name.startswith(".") or len(name) > 120:
-        raise InputError(f"metadata 'id' {name!r} begins with a dot or is over 120 characters")
+    if name.startswith(".") or len(name) > MAX_ID or len(name.encode()) > MAX_ID_BYTES:
+        raise InputError(
+            f"metadata 'id' {name!r} begins with a dot or is over {MAX_ID} characters, or "
+            f"{MAX_ID_BYTES} bytes"
+        )
 
 
 def check_joints(joints: tuple[str, ...]) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import sha256
-from pup.robot_mjcf import read_mjcf
+from pup.robot_mjcf import check_path, read_mjcf
 from pup.robot_parts import (
     Actuator,
     Edit,
@@ -113,6 +113,7 @@ class RobotDescription:
           InputError: no such robot, or a mistake in its files.
         """
         folder = _folder(source)
+        check_path(folder)
         file = folder / "robot.toml"
         text = read_text(file, ROBOT_LIMIT)
         table = Table.read(text, file)
@@ -246,9 +247,15 @@ def _digest(texts: Sequence[str], folder: Path, assets: Sequence[Path]) -> str:
 
 def _folder(source: str | Path) -> Path:
     """The folder of a built-in name or of a path."""
-    if source in built_in_robots():
-        return BUILT_IN / source
     folder = Path(source)
+    if source in built_in_robots():
+        known = BUILT_IN / source
+        if (folder / "robot.toml").is_file() and folder.resolve() != known.resolve():
+            raise InputError(
+                f"{source}: is a built-in robot, and a folder here; write ./{source} for the "
+                "folder, or give it another name"
+            )
+        return known
     if not (folder / "robot.toml").is_file():
         raise InputError(
             f"{source}: neither a built-in robot ({', '.join(built_in_robots())}) "

@@ -82,6 +82,16 @@ def read_mjcf(path: Path) -> MjcfNames:
     )
 
 
+def check_path(path: Path) -> None:
+    """Refuse a path that MuJoCo cannot be told."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{path}: its name, or that of a folder above, is not UTF-8; rename it"
+        ) from error
+
+
 def absent(kind: str, name: str) -> str:
     """What to say of a name the model does not have."""
     return f"model.xml has no {kind} {name!r}; correct the name or add it there"

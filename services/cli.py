@@ -1,5 +1,6 @@
 """The command line `pup`: parse, call, print."""
 
+import io
 import json
 import sys
 import warnings
@@ -26,6 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verb, show = VERBS[options.name], SHOWN[options.name]
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # those of libraries would stand between progress lines
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name need not be UTF-8
     stopping.begin()
     try:
         shown = verb(options)
@@ -133,7 +136,8 @@ def _show_files(shown: dict[str, Any]) -> None:
     for path in shown["files"]:
         print(path)
     if shown.get("left_out"):
-        print(f"not in every recording, so left out: {', '.join(shown['left_out'])}")
+        names = ", ".join(shown["left_out"])
+        print(f"not in every recording, or not to its end, so left out: {names}")
 
 
 def _show_recordings(shown: dict[str, Any]) -> None:

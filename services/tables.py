@@ -8,6 +8,11 @@ from rich.table import Table
 from pup.sysid.wording import thousandths
 
 
+def plain() -> Console:
+    """A console that prints names as they are: `walk[fast]` is no markup, `:a:` no emoji."""
+    return Console(highlight=False, markup=False, emoji=False)
+
+
 def bounds_table(document: dict[str, Any], unit: str) -> None:
     """Print the parameters, their bounds and the losses of a `bounds.json` document.
 
@@ -15,7 +20,7 @@ def bounds_table(document: dict[str, Any], unit: str) -> None:
       document: the document.
       unit: of joint positions.
     """
-    console = Console(highlight=False)
+    console = plain()
     table = Table(title=f"{document['robot']}: parameters and bounds", title_justify="left")
     for column in ("parameter", "nominal", "lower", "upper", "unit", "identified"):
         numeric = column in ("nominal", "lower", "upper")
@@ -47,7 +52,7 @@ def stages_table(documents: dict[str, Any]) -> None:
     """
     from services.job_report import TITLES, found, title
 
-    console = Console(highlight=False)
+    console = plain()
     table = Table(title="stages", title_justify="left")
     table.add_column("stage")
     table.add_column("s", justify="right")
@@ -62,7 +67,7 @@ def stages_table(documents: dict[str, Any]) -> None:
 
 def replay_table(document: dict[str, Any]) -> None:
     """Print the errors of a `replay.json` document."""
-    console = Console(highlight=False)
+    console = plain()
     table = Table(title=f"{document['robot']}: replayed", title_justify="left")
     table.add_column("recording", overflow="fold")
     table.add_column(f"RMSE, {document['unit']}", justify="right")
@@ -114,7 +119,7 @@ def diagnosis_table(document: dict[str, Any]) -> None:
     def small(error: float) -> str:
         return f"{thousandths(error)} {unit}"
 
-    console = Console(highlight=False)
+    console = plain()
     console.print(f"{document['robot']}: {document['verdict']}", style="bold")
     if document["reason"]:
         console.print(document["reason"], soft_wrap=True)
@@ -155,7 +160,7 @@ def experiment_table(shown: dict[str, Any]) -> None:
         return
     from services.experiment.report import estimated
 
-    console = Console(highlight=False)
+    console = plain()
     table = Table(title="what was to be shown", title_justify="left")
     table.add_column("line", overflow="fold")
     for column in ("found", "robots", "bar", ""):

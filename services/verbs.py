@@ -225,14 +225,14 @@ def _diagnose(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _import(options: argparse.Namespace) -> dict[str, Any]:
-    from pup.importers import ImportOptions, import_recordings, unknown_repeats, write_imported
+    from pup import importers
 
     robot = RobotDescription.load(options.robot) if options.robot else None
-    read = import_recordings(
+    read = importers.import_recordings(
         options.format,
         options.paths,
         robot,
-        ImportOptions(
+        importers.ImportOptions(
             robot=options.robot_name,
             motion=options.motion,
             support=options.support,
@@ -240,15 +240,17 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
             repeat_of=options.repeat_of,
             setup=_setup(options.setup),
             notes=options.notes,
-            joints=tuple(options.joints.split(",")) if options.joints else (),
+            joints=tuple(map(str.strip, options.joints.split(","))) if options.joints else (),
             state_topic=options.state_topic,
             command_topic=options.command_topic,
         ),
     )
     with _folder(options.out) as out:
-        files = write_imported(read, out)
-        for one in unknown_repeats(read, out):
+        files = importers.write_imported(read, out)
+        for one in importers.unknown_repeats(read, out):
             _tell(f"warning: {one.id!r} repeats {one.repeat_of!r}, which is not in {out}")
+        for folder in importers.overlooked(options.format, options.paths):
+            _tell(f"warning: {folder} holds logs too, which are not imported; name it as well")
         return {"recordings": [str(file) for file in files]}
 
 

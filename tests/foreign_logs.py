@@ -97,8 +97,12 @@ def write_npz(path: Path, qpos: str = "sensordata") -> Path:
 
 
 def write_ros(
-    path: Path, stamped: bool = True, compression: CompressionType = CompressionType.ZSTD
+    path: Path,
+    stamped: bool = True,
+    compression: CompressionType = CompressionType.ZSTD,
+    commands: float | None = 0.0,
 ) -> Path:
+    """A ROS 2 log; `commands` is how far their clock is ahead, s, or None for none."""
     with path.open("wb") as file:
         writer = RosWriter(file, compression=compression)
         definition = mcap_format.JOINT_STATE.data.decode()
@@ -108,7 +112,10 @@ def write_ros(
                 (0, "/joint_command", ["b", "a"]),
                 (10_000_000, "/joint_states", ["a", "b", "c"]),
             ):
-                now = 1_700_000_000_000_000_000 + 20_000_000 * i + late
+                if commands is None and not late:
+                    continue
+                ahead = 0 if late else round((commands or 0.0) * 10**9)
+                now = 1_700_000_000_000_000_000 + 20_000_000 * i + late + ahead
                 stamp = {"sec": now // 10**9, "nanosec": now % 10**9} if stamped else {}
                 message = {
                     "header": {"stamp": stamp, "frame_id": ""},

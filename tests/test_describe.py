@@ -48,6 +48,8 @@ WALKER = "".join(
         "</robot>",
     )
 )
+ODOMETRY = """<link name="odom"/><joint name="base_joint" type="floating">
+  <parent link="odom"/><child link="base"/></joint>"""
 
 
 def urdf(folder: Path, text: str = WALKER) -> Path:
@@ -189,6 +191,7 @@ def test_groups_are_told_by_names(name: str, group: str) -> None:
         ("<robot name='r'><link name='a'/></robot>", "no hinge or slide joint"),
         ("<robot", "MuJoCo refuses it"),
         (WALKER.replace('<sphere radius="0.02"/>', '<mesh filename="a.stl"/>'), "is not there"),
+        (WALKER.replace("</robot>", f"{ODOMETRY}</robot>"), "'base' is free, but hangs on 'odom'"),
     ],
 )
 def test_what_cannot_be_described_is_refused_in_a_line(
@@ -199,6 +202,13 @@ def test_what_cannot_be_described_is_refused_in_a_line(
     err = capsys.readouterr().err
     assert told in err and len(err.splitlines()) == 1
     assert not out.exists()
+
+
+def test_names_that_mujoco_cannot_be_told_are_refused(tmp_path: Path) -> None:
+    for source, out in (("a_\udcfc", "out"), ("a", "out_\udcfc")):
+        with pytest.raises(InputError, match="is not UTF-8"):
+            draft_robot(urdf(tmp_path / source), tmp_path / out)
+        assert not (tmp_path / out).exists()
 
 
 def test_the_command_tells_what_to_look_at_and_overwrites_nothing(

@@ -1,6 +1,7 @@
 """Exports, each read back by a reader of its format that is not ours."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from commandline import files, pup
+from foreign_logs import ARM, write_ros
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -205,6 +207,17 @@ def test_lerobot_holds_commands_and_interpolates_readings(tmp_path: Path) -> Non
     assert "observation.voltage" not in table.column_names
 
 
+def test_lerobot_turns_on_through_half_a_turn(tmp_path: Path) -> None:
+    """What lies between 3.1 rad and -3.1 is half a turn, not 0."""
+    yaw, unwrapped = [3.1, 3.14, -3.06], [3.1, 3.2, 3.6]
+    rows = {"time": [0.0, 0.2, 0.4], "extras": {"imu/yaw": yaw, "imu/roll": unwrapped}}
+    export("lerobot", tmp_path, make(**rows), rate=10)
+    told = np.stack(pq.read_table(tmp_path / "data")["observation.imu"].to_numpy())
+    between = (3.14 - 3.06 + 2 * np.pi) / 2 - 2 * np.pi
+    np.testing.assert_allclose(told[:, 0], [3.1, 3.12, 3.14, between, -3.06], atol=1e-6)
+    np.testing.assert_allclose(told[:, 1], [3.1, 3.15, 3.2, 3.4, 3.6], atol=1e-6)
+
+
 def test_rerun_file_has_the_recording_and_its_replay(tmp_path: Path) -> None:
     simulated = {"position/a": np.array([0.0, 1.0, 2.0, np.nan])}
     export_takes("rrd", [Take(FULL, simulated)], tmp_path)
@@ -300,6 +313,67 @@ def test_a_data_set_is_of_one_robot_and_never_written_over(tmp_path: Path) -> No
     with pytest.raises(InputError, match="data/ already"):
         export("lerobot", tmp_path / "a", make(id="r2"))
     assert files(tmp_path) == before
+
+
+def test_somebody_s_own_log_is_never_written_over(tmp_path: Path) -> None:
+    """The log that a recording was imported from has its name."""
+    log = write_ros(tmp_path / "walk.mcap")
+    before = log.read_bytes()
+    (recording,) = import_recordings("mcap", [log], options=ARM)
+    with pytest.raises(InputError, match=r"walk\.mcap: is not of `pup export`; use another"):
+        export("mcap", tmp_path, recording)
+    assert files(tmp_path) == {"walk.mcap": before}
+    for notes in ("", "again"):
+        export("mcap", tmp_path / "out", replace(recording, notes=notes))
+    assert import_recordings("mcap", [tmp_path / "out"])[0].notes == "again"
+
+
+def test_the_usual_rate_is_that_of_the_readings(tmp_path: Path) -> None:
+    """Commands that are sent 2 ms before each reading stand in rows of their own."""
+    read = np.arange(20) * 0.02 + 0.002
+    time = np.sort(np.append(read - 0.002, read))
+    position = np.where(np.isin(time, read), 0.5, np.nan)
+    both = {"target": np.zeros((40, 2)), "position": np.stack([position, position], axis=1)}
+    assert export("lerobot", tmp_path, make(time=time, **both))["fps"] == 50
+
+
+def test_a_replay_that_broke_down_is_left_out_of_a_data_set(tmp_path: Path) -> None:
+    """The format knows no missing samples, and its last pose held on would be none of it."""
+    replay = {f"position/{name}": np.zeros(4) for name in FULL.joints}
+    for name, end in (("whole", 0.0), ("broken", np.nan)):
+        simulated = replay | {"position/b": np.array([0.0, 0.0, end, end])}
+        told = export_takes("lerobot", [Take(FULL, simulated)], tmp_path / name)
+        info = json.loads((tmp_path / name / "meta" / "info.json").read_text())
+        assert ("observation.simulated_state" in info["features"]) == (name == "whole")
+        assert ("observation.simulated_state" in told["left_out"]) == (name == "broken")
+
+
+def test_a_robot_of_which_no_row_is_whole_is_not_drawn(tmp_path: Path) -> None:
+    """Joints that are read in turn; a replay may break down as soon."""
+    robot = RobotDescription.load("darwin_leg")
+    count = len(robot.joints)
+    turns = np.where(np.arange(12)[:, None] % count == np.arange(count), 0.1, np.nan)
+    recording = make(
+        robot="darwin_leg",
+        joints=robot.joint_names,
+        time=np.arange(12) * 0.02,
+        target=np.zeros((12, count)),
+        position=turns,
+    )
+    export("rrd", tmp_path, recording, robot=robot)
+    time, _ = curve(tmp_path / "r1.rrd", f"/position/{robot.joint_names[1]}/real")
+    np.testing.assert_allclose(time, np.arange(1, 12, count) * 0.02)
+
+
+@pytest.mark.parametrize("format", exporters.FORMATS)
+def test_a_folder_s_name_that_is_not_utf_8_is_told_or_taken(tmp_path: Path, format: str) -> None:
+    out = tmp_path / "\udcff"
+    if format == "mcap":
+        assert len(export(format, out, make())["files"]) == 1
+        return
+    with pytest.raises(InputError, match="its name is not UTF-8; use another folder"):
+        export(format, out, make())
+    assert not out.exists()
 
 
 def test_an_error_in_the_middle_leaves_no_file(

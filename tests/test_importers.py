@@ -1,6 +1,9 @@
 """Importers: what they make of each format, and of the real logs."""
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from commandline import pup
 from foreign_logs import (
     ARM,
     CSV,
@@ -25,7 +29,7 @@ from foreign_logs import (
 from mcap.writer import CompressionType
 
 from pup.errors import InputError
-from pup.importers import ImportOptions, import_recordings, write_imported
+from pup.importers import ImportOptions, import_recordings, overlooked, write_imported
 from pup.importers.common import join
 from pup.importers.darwin_hardware import JOINTS
 from pup.recording import load_recordings
@@ -254,6 +258,16 @@ def test_readings_before_the_first_command_are_left_out_and_told() -> None:
     assert note.startswith("1 readings")
 
 
+def test_times_that_differ_by_rounding_are_one_row() -> None:
+    """Simulators add their steps up, others multiply them."""
+    sent, read = np.arange(50) * 0.02, np.cumsum(np.full(50, 0.02)) - 0.02
+    assert (sent != read).any()
+    columns, note = join(sent, read - 1e-17, {"c": sent}, {"s": read})
+    np.testing.assert_array_equal(columns["time"], sent)
+    np.testing.assert_array_equal(columns["s"], read)
+    assert note == ""
+
+
 def test_a_robot_gives_its_name_and_must_fit(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV)
     robot = RobotDescription.load("servo_bench")
@@ -279,6 +293,56 @@ def test_refuses_unknown_formats_absent_paths_and_equal_ids(tmp_path: Path) -> N
         (tmp_path / folder / "log.csv").write_text(CSV)
     with pytest.raises(InputError, match="id 'log' is also that of"):
         import_recordings("csv", [tmp_path / "one", tmp_path / "two"], options=ARM)
+
+
+def test_hidden_logs_of_a_folder_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    (tmp_path / "._log.csv").write_bytes(b"\0\5\x16\7\xb0")
+    assert [r.id for r in import_recordings("csv", [tmp_path], options=ARM)] == ["log"]
+    write_sage(tmp_path / "s" / "step")
+    write_sage(tmp_path / "s" / ".Trash" / "old")
+    assert [r.id for r in import_recordings("sage", [tmp_path / "s"], options=ARM)] == ["step"]
+    with pytest.raises(InputError, match=r"log\.csv: is given twice"):
+        import_recordings("csv", [tmp_path, tmp_path / "log.csv"], options=ARM)
+
+
+def test_no_log_of_a_folder_is_left_out_in_silence(tmp_path: Path) -> None:
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    for name in ("1.csv", "2.CSV", "monday/3.csv", "monday/deeper/4.csv"):
+        (logs / name).parent.mkdir(parents=True, exist_ok=True)
+        (logs / name).write_text(CSV)
+    command = ["import", "csv", logs, "--robot-name", "arm", "--motion", "step", "--out", out]
+    done = pup(*command, "--support", "bench")
+    assert (done.code, done.out.split()) == (0, [str(out / f"{i}.parquet") for i in (1, 2)])
+    told = f"warning: {logs / 'monday'} holds logs too, which are not imported; name it as well"
+    assert done.err.splitlines() == [told]
+    assert overlooked("csv", [logs, logs / "monday"]) == [logs / "monday" / "deeper"]
+    for name in ("1.csv", "2.CSV"):
+        (logs / name).unlink()
+    with pytest.raises(InputError, match=r"no \*\.csv in this folder, but in .*monday; name that"):
+        import_recordings("csv", [logs], options=ARM)
+
+
+def test_a_folder_may_be_called_as_a_log(tmp_path: Path) -> None:
+    """As the folders of ROS 2 may be; each has its logs in it."""
+    write_ros(tmp_path / "a.mcap")
+    (tmp_path / "walk.mcap").mkdir()
+    write_ros(tmp_path / "walk.mcap" / "walk_0.mcap")
+    assert [r.id for r in import_recordings("mcap", [tmp_path], options=ARM)] == ["a"]
+    assert overlooked("mcap", [tmp_path]) == [tmp_path / "walk.mcap"]
+
+
+def test_what_was_imported_into_a_folder_of_any_name_is_told(tmp_path: Path) -> None:
+    """Where the terminal is strict, as with most locales, the name is written as it is."""
+    (tmp_path / "log.csv").write_text(CSV)
+    out = tmp_path / "\udcff"
+    command = [*(sys.executable, "-m", "services.cli", "import", "csv"), tmp_path / "log.csv"]
+    command += [*("--robot-name", "arm", "--motion", "step", "--support", "bench"), "--out", out]
+    strict = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
+    for _ in range(2):  # the second finds the first there
+        done = subprocess.run(command, capture_output=True, timeout=300, env=strict)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip() == os.fsencode(out / "log.parquet")
 
 
 # The real logs

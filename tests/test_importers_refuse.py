@@ -3,12 +3,14 @@
 import io
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
+from commandline import pup
 from foreign_logs import (
     ARM,
     CSV,
@@ -29,6 +31,7 @@ from mcap.writer import CompressionType
 
 from pup.errors import InputError
 from pup.importers import FORMATS, ImportOptions, import_recordings, mcap_format, npz
+from pup.recording import Recording
 
 DARWIN_WRONG: list[tuple[dict[str, Any], str]] = [
     ({"pose": [[0.0] * 20] * 5 + [[0.0] * 19]}, "'pose' has rows of different lengths"),
@@ -132,6 +135,8 @@ def test_emps_files_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
         ("voltage", "", "'' has no name"),
         ("target/a", "target/b", "'target/b'"),
         (CSV, "", "line 1"),
+        (CSV, CSV.replace(",", ";"), "line 1: no comma in 'time;target/a"),
+        (CSV, f"# of the arm\n{CSV}", "line 1: no comma in '# of the arm'"),
         (CSV, "# pup.recording: {\n", "not a JSON"),
         (CSV, "# pup.recording: []\n", "schema"),
         (CSV, '# pup.recording: {"schema": 2}\n', "schema is 2"),
@@ -235,6 +240,57 @@ def test_mcap_rows_are_refused(tmp_path: Path, rows: list[Any], told: str) -> No
     path = write_json_mcap(tmp_path / "log.mcap", rows, CompressionType.ZSTD)
     with pytest.raises(InputError, match=told):
         one("mcap", path, ARM)
+
+
+def test_mcap_tells_what_is_missing_for_commands(tmp_path: Path) -> None:
+    path = write_ros(tmp_path / "log.mcap", commands=None)
+    for chosen in (None, "/joint_states"):
+        with pytest.raises(InputError, match=r"there is only /joint_states: .* record both"):
+            one("mcap", path, replace(ARM, state_topic=chosen))
+    path = write_ros(tmp_path / "log.mcap", commands=3600.0)
+    told = r"log\.mcap: the last reading is 3599\.91 s before the first command.* of one clock\?"
+    with pytest.raises(InputError, match=told):
+        one("mcap", path, ARM)
+
+
+def test_joints_of_an_archive_are_named_once_and_may_stand_apart(tmp_path: Path) -> None:
+    """Of two columns of one name one would be lost."""
+    arrays = {f"{kind}_times": np.arange(4) * 0.02 for kind in ("control", "sensordata")}
+    arrays |= {f"{kind}_data": np.zeros((4, 2)) for kind in ("control", "sensordata")}
+    np.savez(tmp_path / "t.npz", **arrays)
+    command = ["import", "npz", tmp_path / "t.npz", "--robot-name", "arm", "--motion", "step"]
+    command += ["--support", "bench", "--out", tmp_path / "out", "--joints"]
+    done = pup(*command, "hip,hip")
+    assert (done.code, "--joints hip,hip: names a joint twice" in done.err) == (2, True)
+    assert pup(*command, "hip, knee").code == 0
+    assert Recording.read(tmp_path / "out" / "t.parquet").joints == ("hip", "knee")
+
+
+def test_a_recording_does_not_repeat_itself(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    with pytest.raises(InputError, match="--repeat-of log: is the recording itself"):
+        one("csv", tmp_path / "log.csv", replace(ARM, repeat_of="log"))
+
+
+@pytest.mark.parametrize("format", ["mcap", "npz"])
+def test_a_log_that_cannot_be_opened_is_not_told_as_damaged(tmp_path: Path, format: str) -> None:
+    with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)"):
+        FORMATS[format](tmp_path, ARM)
+
+
+def test_a_message_is_short_whatever_the_file_holds(tmp_path: Path) -> None:
+    """What a power loss leaves of a file may be as many zeros as it had bytes."""
+    for content in ("\0" * 100_000, f"{'x' * 10_000}," * 2, "x,y\n1," + "\0" * 9000):
+        (tmp_path / "log.csv").write_text(content)
+        with pytest.raises(InputError, match=r"log\.csv: line [12]") as refused:
+            one("csv", tmp_path / "log.csv", ARM)
+        assert len(str(refused.value)) < 400 + len(str(tmp_path))
+
+
+def test_text_in_another_encoding_is_told(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_bytes(CSV.replace("voltage", "größe").encode("latin-1"))
+    with pytest.raises(InputError, match="save it as UTF-8"):
+        one("csv", tmp_path / "log.csv", ARM)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Recordings: what they keep, load and fit."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,41 @@ def test_refuses_sets_that_are_empty_or_name_an_id_twice(tmp_path: Path) -> None
         make(id="same").write(tmp_path / f"{name}.parquet")
     with pytest.raises(InputError, match=r"y\.parquet: id 'same' is also that of .*x\.parquet"):
         load_recordings([tmp_path])
+
+
+def test_hidden_files_are_no_recordings(tmp_path: Path) -> None:
+    """A write that was killed leaves `.new-...`, and macOS a `._r1.parquet` beside each file."""
+    make().write(tmp_path / "r1.parquet")
+    make().write(tmp_path / ".new-x1y2" / "r1.parquet")
+    (tmp_path / "._r1.parquet").write_bytes(b"\0\5\x16\7")
+    assert [recording.id for recording in load_recordings([tmp_path])] == ["r1"]
+    (tmp_path / "r1.parquet").unlink()
+    with pytest.raises(InputError, match=r"no \*\.parquet in this folder; see"):
+        load_recordings([tmp_path])
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_what_may_not_be_read_is_told_so(tmp_path: Path) -> None:
+    make().write(tmp_path / "set" / "r1.parquet")
+    for path, told in ((tmp_path / "set", "rights"), (tmp_path / "set" / "r1.parquet", "Permiss")):
+        rights = path.stat().st_mode
+        path.chmod(0)
+        with pytest.raises(InputError, match=f"cannot be read.*{told}"):
+            load_recordings([path])
+        path.chmod(rights)
+
+
+def test_a_folder_s_name_need_not_be_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / "log_\udcff" / "r1.parquet"
+    make().write(path)
+    assert Recording.read(path).digest == make().digest
+    assert read_header(path).rows == 3
+
+
+def test_a_file_that_is_given_twice_is_told(tmp_path: Path) -> None:
+    make().write(tmp_path / "r1.parquet")
+    with pytest.raises(InputError, match=r"r1\.parquet: is given twice; name it once"):
+        load_recordings([tmp_path, tmp_path / "r1.parquet"])
 
 
 SERVO = make(

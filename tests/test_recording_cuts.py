@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import make
 
 from pup.errors import InputError
 from pup.recording import Recording
@@ -64,3 +65,13 @@ def test_thinned_keeps_all_commands_and_some_readings() -> None:
     thin = thinned(WHOLE, 4)
     assert thin.target.tolist() == WHOLE.target.tolist()
     assert np.flatnonzero(~np.isnan(thin.position[:, 0])).tolist() == [0, 4, 8]
+
+
+def test_thinning_counts_readings_and_not_rows_of_commands() -> None:
+    time = np.arange(8) / 100
+    position = np.where(np.arange(8) % 2, np.arange(8.0), np.nan)[:, None]
+    log = make(joints=("a",), time=time, target=np.zeros((8, 1)), position=position)
+    assert np.flatnonzero(~np.isnan(thinned(log, 2).position[:, 0])).tolist() == [1, 5]
+    assert thinned(log, 1).digest == log.digest
+    with pytest.raises(InputError, match="give 1 or more"):
+        thinned(log, 0)

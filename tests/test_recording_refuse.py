@@ -188,6 +188,13 @@ def test_a_flipped_byte_is_refused_or_harmless(
         assert np.array_equal(values, kept[name], equal_nan=True)
 
 
+def test_an_id_is_as_long_as_a_file_s_name_may_be(tmp_path: Path) -> None:
+    """File systems count bytes, of which most characters of the world have several."""
+    make(id="é" * 115).write(tmp_path / f"{'é' * 115}.parquet")
+    with pytest.raises(InputError, match="over 120 characters, or 230 bytes"):
+        make(id="歩" * 80)
+
+
 def test_construction_refuses_what_a_file_could_not_hold() -> None:
     cases: list[tuple[dict[str, Any], str]] = [
         ({"joints": ()}, "no target"),

@@ -15,7 +15,7 @@ from pup.sysid.html import tag
 from pup.sysid.loss import ReplayLoss
 from pup.sysid.overlays import write_overlays
 from pup.sysid.result import SubsetFit
-from services.tables import bounds_table
+from services.tables import bounds_table, replay_table
 from tests.reports import BOUNDS, DARWIN, RECORDINGS, Page, make_recording, make_replay, report
 
 
@@ -265,6 +265,24 @@ def test_split_is_told_with_its_meaning(tmp_path: Path) -> None:
         "0.0005",
         "split",
     ]
+
+
+def test_names_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("walk[fast]", "[bold]x", ":smile:", "a[", "b]")
+    replay_table(
+        {
+            "robot": "r",
+            "unit": "rad",
+            "per_recording": dict.fromkeys(names, 0.1),
+            "diverged": [],
+            "rmse": 0.1,
+            "actuator": "pd",
+            "model": "robots[/old]/robot.toml",
+        }
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines[4 : 4 + len(names)]] == list(names)
+    assert lines[-1] == "model: pd, robots[/old]/robot.toml"
 
 
 @pytest.mark.parametrize(

@@ -176,6 +176,25 @@ def test_no_such_robot_names_the_built_in_ones(tmp_path: Path) -> None:
     refused(tmp_path, "nor a folder with a robot.toml")
 
 
+def test_a_folder_that_mujoco_cannot_be_told_is_refused(tmp_path: Path) -> None:
+    """From a memory stick, say, on which names are in another encoding."""
+    folder = robot_folder(tmp_path / "arm_\udcfc")
+    refused(folder, "its name, or that of a folder above, is not UTF-8")
+
+
+def test_a_folder_called_as_a_built_in_robot_is_not_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of `--robot emps` beside a folder `emps` nobody could tell which robot was meant."""
+    robot_folder(tmp_path / "emps")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"a built-in robot, and a folder here; write \./"):
+        RobotDescription.load("emps")
+    assert RobotDescription.load("./emps").folder == tmp_path / "emps"
+    (tmp_path / "emps" / "robot.toml").unlink()  # a folder of logs, say
+    assert RobotDescription.load("emps").name == "emps"
+
+
 def refused(folder: Path, words: str) -> None:
     """The folder is refused in one line that contains the words."""
     with pytest.raises(InputError, match=re.escape(words)) as error:

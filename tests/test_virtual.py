@@ -3,6 +3,7 @@
 import json
 import runpy
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -284,6 +285,21 @@ def test_record_does_not_mix_with_other_recordings(op2: RobotDescription, tmp_pa
     record(op2, ("step:0.1",), tmp_path, seed=2)
     with pytest.raises(InputError, match=r"step_0\.1\.parquet"):
         record(op2, ("step:0.3",), tmp_path, seed=1)
+
+
+def test_a_real_recording_is_never_written_over(tmp_path: Path) -> None:
+    """Motions have the same names on a real robot and on a virtual one."""
+    bench = RobotDescription.load("servo_bench")
+    (made,) = record(bench, ["hold"], tmp_path, seed=1)
+    real = replace(made, source="hardware", notes="the only one")
+    file = tmp_path / "hold.parquet"
+    real.write(file)
+    with pytest.raises(InputError, match=r"holds other recordings \(hold\.parquet\)"):
+        record(bench, ["hold"], tmp_path, seed=2)
+    assert Recording.read(file).notes == "the only one"
+    made.write(file)
+    record(bench, ["hold"], tmp_path, seed=2)
+    assert Recording.read(file).digest != made.digest
 
 
 class TestShipped:

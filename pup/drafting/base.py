@@ -32,9 +32,16 @@ def free_base(
     """The body that is free; None for a fixed base. What else moves is deleted.
 
     Raises:
-      InputError: several robots are free, or the model has no base link to let go.
+      InputError: several robots are free, one hangs on something, or the model has no base link to
+        let go.
     """
     loose = [joint.parent for joint in of_type(spec, mujoco.mjtJoint.mjJNT_FREE)]
+    for body in loose:
+        if body.parent.name != "world":
+            raise InputError(
+                f"{source}: {body.name!r} is free, but hangs on {body.parent.name!r}; nothing may "
+                "be above a free body: leave that out"
+            )
     robots = [body for body in loose if any(_driven(below) for below in _below(body))]
     if len(robots) > 1:
         bodies = ", ".join(body.name for body in robots)

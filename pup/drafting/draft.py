@@ -4,6 +4,7 @@ MuJoCo reads both. What it knows of joints, servos and contact is written down a
 no model tells is guessed, and told as such.
 """
 
+import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from pup.errors import InputError
 from pup.files import write_atomic
 from pup.physics.model import compile_model
 from pup.robot import RobotDescription
+from pup.robot_mjcf import check_path
 from pup.robot_parts import Joint
 from pup.robot_toml import NAME
 
@@ -86,6 +88,10 @@ def draft_robot(source: Path, folder: Path, name: str = "", free: bool = False) 
     """
     if not source.is_file():
         raise InputError(f"{source}: no such file; name an MJCF or a URDF file")
+    for path in (source, folder):
+        check_path(path)
+    if not os.access(source, os.R_OK):
+        raise InputError(f"{source}: cannot be read; change its rights")
     if source.suffix.lower() not in KINDS:
         raise InputError(f"{source}: name an MJCF file (.xml) or a URDF file (.urdf)")
     if name and not NAME.fullmatch(name):

@@ -53,10 +53,13 @@ def export_takes(
       InputError: the format cannot hold these recordings, or the folder is not free for them.
     """
     require(format, rate)
+    _check_name(format, folder)
     folder.mkdir(parents=True, exist_ok=True)
     if format == "lerobot":
         return _data_set(takes, folder, rate)
     files = [folder / f"{take.recording.id}.{format}" for take in takes]
+    if format == "mcap":
+        _keep_others(files)
     with TemporaryDirectory(dir=folder, prefix=".new-") as new:
         for take, file in zip(takes, files, strict=True):
             if format == "rrd":
@@ -70,6 +73,24 @@ def export_takes(
         for file in files:
             os.replace(Path(new) / file.name, file)
     return {"files": [str(file) for file in files]}
+
+
+def _check_name(format: str, folder: Path) -> None:
+    """Refuse a name that pyarrow and Rerun cannot write under."""
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError as error:
+        if format != "mcap":
+            raise InputError(f"{folder}: its name is not UTF-8; use another folder") from error
+
+
+def _keep_others(files: Sequence[Path]) -> None:
+    """Refuse to write over logs that are not ours, such as those that the recordings come from."""
+    from pup.exporters import mcap_format
+
+    for file in files:
+        if file.exists() and not mcap_format.is_own(file):
+            raise InputError(f"{file}: is not of `pup export`; use another folder")
 
 
 def _data_set(takes: Sequence[Take], folder: Path, rate: int | None) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from pup.errors import InputError
 from pup.exporters.common import Array, Take
 from pup.files import write_json
+from pup.recording import Recording
 from pup.recording_rules import PER_JOINT
 
 VERSION = "v3.0"
@@ -29,6 +30,7 @@ PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 ACTION, STATE, SIMULATED = "action", "observation.state", "observation.simulated_state"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 HELD = ("target", "torque_enabled")
+TURNING = ("imu/roll", "imu/yaw")
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 RATES = (1, 1000)  # Hz
 
@@ -57,10 +59,11 @@ def write(takes: Sequence[Take], folder: Path, rate: int | None = None) -> dict[
     Args:
       takes: all of one robot.
       folder: of the data set, empty.
-      rate: frames per second; None for what the recordings have most often.
+      rate: frames per second; None for what the readings have most often.
 
     Returns:
-      The rate as `fps`, and as `left_out` the columns that not every recording has.
+      The rate as `fps`, and as `left_out` the columns that not every recording has, and the
+      replays where one of them broke down.
 
     Raises:
       InputError: recordings of several robots, or too short for the rate.
@@ -87,8 +90,15 @@ def write(takes: Sequence[Take], folder: Path, rate: int | None = None) -> dict[
 
 
 def _usual_rate(takes: Sequence[Take]) -> int:
-    gaps = np.concatenate([np.diff(take.recording.time) for take in takes])
+    """Of the readings: commands of a log that has times of its own stand in rows between them."""
+    gaps = np.concatenate([np.diff(_read_times(take.recording)) for take in takes])
     return int(np.clip(round(1 / float(np.median(gaps))), *RATES))
+
+
+def _read_times(recording: Recording) -> Array:
+    """When positions were read; all times where that was but once."""
+    read = ~np.isnan(recording.position).all(axis=1)
+    return recording.time[read] if read.sum() > 1 else recording.time
 
 
 def _features(
@@ -101,7 +111,8 @@ def _features(
         ACTION: Feature(tuple(f"target/{name}" for name in joints), tuple(joints)),
         STATE: Feature(tuple(f"position/{name}" for name in joints), tuple(joints)),
     }
-    if all(_measured(take.simulated) for take in takes):
+    replayed = all(_replayed(take, joints) for take in takes)
+    if replayed:
         columns = tuple(f"position/{name}" for name in joints)
         features[SIMULATED] = Feature(columns, tuple(joints), replayed=True)
     for kind in (*PER_JOINT[2:], "imu"):
@@ -113,7 +124,15 @@ def _features(
         if name in everywhere:
             features[f"observation.{name}"] = Feature((name,), (name,))
     some = set.union(*measured) - everywhere
-    return features, tuple(name for name in _columns(takes) if name in some)
+    left_out = [name for name in _columns(takes) if name in some]
+    left_out += [SIMULATED] if not replayed and any(take.simulated for take in takes) else []
+    return features, tuple(left_out)
+
+
+def _replayed(take: Take, joints: Sequence[str]) -> bool:
+    """Whether there is a replay, and to the end."""
+    columns = [take.simulated.get(f"position/{name}") for name in joints]
+    return all(values is not None and not np.isnan(values).any() for values in columns)
 
 
 def _measured(columns: Any) -> set[str]:
@@ -153,7 +172,14 @@ def _resampled(name: str, time: Array, values: Array, at: Array) -> Array:
     if name.partition("/")[0] in HELD:
         before = np.searchsorted(time, at + 1e-9, side="right") - 1
         return np.asarray(values[np.maximum(before, 0)])
-    return np.asarray(np.interp(at, time, values))
+    return _turned(time, values, at) if name in TURNING else np.asarray(np.interp(at, time, values))
+
+
+def _turned(time: Array, values: Array, at: Array) -> Array:
+    """An angle at other times, rad: from one side of half a turn it goes to the other, not back."""
+    told = np.asarray(np.interp(at, time, np.unwrap(values)))
+    whole = np.abs(values).max() > np.pi  # told unwrapped already
+    return told if whole else np.asarray((told + np.pi) % (2 * np.pi) - np.pi)
 
 
 class _Store:

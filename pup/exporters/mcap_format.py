@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.records import Header
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from pup.exporters.common import Array, Take, nested
@@ -20,6 +22,8 @@ from pup.exporters.common import Array, Take, nested
 METADATA = "pup.recording"
 RECORDING, SIMULATED = "/recording", "/simulated"
 NANOSECONDS = 1e9
+LIBRARY = "pup"
+"""What the head of a log says it was written by."""
 
 
 def write(take: Take, path: Path) -> None:
@@ -27,7 +31,7 @@ def write(take: Take, path: Path) -> None:
     recording = take.recording
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
-    writer.start(library="pup")
+    writer.start(library=LIBRARY)
     writer.add_metadata(METADATA, {"json": json.dumps(recording.metadata())})
     log_time = np.round((recording.time - recording.time[0]) * NANOSECONDS).astype(np.int64)
     _topic(writer, RECORDING, log_time, list(recording.columns()))
@@ -36,6 +40,16 @@ def write(take: Take, path: Path) -> None:
         _topic(writer, SIMULATED, log_time, columns)
     writer.finish()
     path.write_bytes(buffer.getvalue())
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file is one that `write` made, and not somebody's own log."""
+    try:
+        with path.open("rb") as file:
+            head = next(iter(StreamReader(file).records), None)
+    except Exception:  # other files make the reader raise nearly anything
+        return False
+    return isinstance(head, Header) and head.library == LIBRARY
 
 
 def _topic(

@@ -24,7 +24,7 @@ def draw_bodies(
     entity: Sequence[str],
     look: Look,
 ) -> None:
-    """Draw the robot in every row in which all its joints are known.
+    """Draw the robot in every row in which all its joints are known; nothing where none is so.
 
     On the ground it stands with its lowest point on the floor and leans as the IMU says, or with
     its feet flat; where it went to is in no recording.
@@ -40,6 +40,8 @@ def draw_bodies(
     model = compile_model(robot, support)
     position = np.stack([columns[f"position/{name}"] for name in robot.joint_names], axis=1)
     rows = np.flatnonzero(~np.isnan(position).any(axis=1))
+    if not len(rows):
+        return
     places, turns = _poses(robot, model, position[rows], _tilt(columns)[rows])
     time = rr.TimeColumn(TIMELINE, duration=(columns["time"] - columns["time"][0])[rows])
     for body in range(1, model.compiled.nbody):

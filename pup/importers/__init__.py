@@ -8,9 +8,17 @@ from pup.errors import InputError
 from pup.importers import bam, csv_format, darwin_hardware, emps, mcap_format, npz, sage
 from pup.importers.common import ImportOptions
 from pup.recording import Recording, write_recordings
+from pup.recording_file import visible
 from pup.robot import RobotDescription
 
-__all__ = ["FORMATS", "ImportOptions", "import_recordings", "unknown_repeats", "write_imported"]
+__all__ = [
+    "FORMATS",
+    "ImportOptions",
+    "import_recordings",
+    "overlooked",
+    "unknown_repeats",
+    "write_imported",
+]
 
 Importer = Callable[[Path, ImportOptions], list[Recording]]
 
@@ -72,12 +80,18 @@ def import_recordings(
             raise InputError(f"{path}: {error}") from error
         for recording in found:
             if recording.id in origin:
+                if path.resolve() == origin[recording.id].resolve():
+                    raise InputError(f"{path}: is given twice; name it once")
                 raise InputError(
                     f"{path}: id {recording.id!r} is also that of {origin[recording.id]}; "
                     "rename one of the files"
                 )
             origin[recording.id] = path
         recordings += found
+    if any(recording.id == options.repeat_of for recording in recordings):
+        raise InputError(
+            f"--repeat-of {options.repeat_of}: is the recording itself; name the first"
+        )
     if options.repeat_of is not None and len(recordings) > 1:
         raise InputError(
             f"--repeat-of is of one recording, and here are {len(recordings)}; import it alone"
@@ -119,14 +133,43 @@ def unknown_repeats(recordings: Sequence[Recording], folder: Path) -> list[Recor
     return [r for r in recordings if r.repeat_of is not None and r.repeat_of not in known]
 
 
+def overlooked(format: str, paths: Sequence[Path]) -> list[Path]:
+    """Folders in those that are given, which hold logs of a format and are not given themselves."""
+    given = [path for path in paths if path.is_dir()]
+    own = {path.resolve() for path in given}
+    below = [inner for path in given for inner in _below(path, PATTERNS[format])]
+    return [inner for inner in below if inner.resolve() not in own]
+
+
+def _below(folder: Path, pattern: str) -> list[Path]:
+    """Folders in a folder that hold logs which are not taken from it; sorted."""
+    if pattern.startswith("**"):
+        return []
+    return list(dict.fromkeys(log.parent for log in visible(folder, f"*/{_any_case(pattern)}")))
+
+
+def _inside(folder: Path, pattern: str) -> list[Path]:
+    """Logs of a folder; ROS 2 calls the folder of a log as another program does the log."""
+    return [log for log in visible(folder, _any_case(pattern)) if not log.is_dir()]
+
+
+def _any_case(pattern: str) -> str:
+    """The pattern for a kind of file in small and in capital letters, as some loggers write it."""
+    kind = pattern.removeprefix("*.")
+    if kind == pattern:
+        return pattern
+    return "*." + "".join(f"[{letter}{letter.upper()}]" for letter in kind)
+
+
 def _logs(paths: Sequence[Path], pattern: str) -> list[Path]:
     logs: list[Path] = []
     for path in map(Path, paths):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
-        found = sorted(path.glob(pattern)) if path.is_dir() else [path]
+        found = _inside(path, pattern) if path.is_dir() else [path]
         if not found:
-            raise InputError(f"{path}: no {pattern} in this folder")
+            inside = [f", but in {folder}; name that" for folder in _below(path, pattern)]
+            raise InputError(f"{path}: no {pattern} in this folder{''.join(inside[:1])}")
         logs += found
     if not logs:
         raise InputError("no log given; name files or folders")

@@ -1,10 +1,11 @@
 """What the importers share: options, limited reading, and joining commands with readings."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 MAX_TEXT = 64 * 2**20  # bytes of a text file, which takes 20 times as much once parsed
 MAX_UNPACKED = 2**30  # bytes of a compressed file once unpacked
 MAX_CELLS = 20_000_000  # numbers in one recording
+SAME = 1e-9  # s; times that are the same but for how a program added them up are nearer
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,17 @@ class ImportOptions:
         return known
 
 
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """A binary log; one that cannot be opened is not told as a damaged one."""
+    try:
+        file = path.open("rb")
+    except MISTAKES as error:
+        raise InputError(f"cannot be read ({error.strerror})") from error
+    with file:
+        yield file
+
+
 def read_text(path: Path, limit: int = MAX_TEXT) -> str:
     """Read a UTF-8 text file of limited size."""
     try:
@@ -80,7 +93,7 @@ def read_text(path: Path, limit: int = MAX_TEXT) -> str:
     except MISTAKES as error:
         raise InputError(f"cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 text ({error})") from error
+        raise InputError(f"not UTF-8 text ({error}); save it as UTF-8") from error
 
 
 def parse_json(text: str) -> Any:
@@ -176,7 +189,15 @@ def join(
     check_increasing(state_time, "state time")
     if not len(command_time) or not len(state_time):
         raise InputError("no commands" if len(state_time) else "no readings")
+    after = np.minimum(np.searchsorted(command_time, state_time - SAME), len(command_time) - 1)
+    beside = np.abs(command_time[after] - state_time) <= SAME
+    state_time = np.where(beside, command_time[after], state_time)
     kept = state_time >= command_time[0]
+    if not kept.any():
+        raise InputError(
+            f"the last reading is {command_time[0] - state_time[-1]:.9g} s before the first "
+            "command, so that none is left; are both of one clock?"
+        )
     time = np.union1d(command_time, state_time[kept])
     if len(time) * (1 + len(commands) + len(states)) > MAX_CELLS:
         raise InputError(f"more than {MAX_CELLS} numbers; cut the log")

@@ -17,6 +17,8 @@ from pup.recording import Recording, from_columns
 
 MARK = "# pup.recording:"
 MAX_FILE = 256 * 2**20  # bytes
+SHOWN = 60
+"""Characters of a cell that a message shows."""
 
 
 def read(path: Path, options: ImportOptions) -> list[Recording]:
@@ -49,9 +51,16 @@ def _columns(lines: list[str], skipped: int) -> dict[str, Array]:
         names = [name.strip() for name in next(table, [])]
         if not names:
             raise InputError(f"line {skipped + 1}: no column names")
+        if len(names) == 1:
+            raise InputError(
+                f"line {skipped + 1}: no comma in {_shown(names[0])}; column names and cells are "
+                "separated by commas, and numbers have points"
+            )
         for name in names:
             if not name or names.count(name) > 1:
-                raise InputError(f"line {skipped + 1}: column {name!r} has no name or stands twice")
+                raise InputError(
+                    f"line {skipped + 1}: column {_shown(name)} has no name or stands twice"
+                )
         if len(lines) * len(names) > MAX_CELLS:
             raise InputError(f"more than {MAX_CELLS} numbers; cut the log")
         rows = []
@@ -66,6 +75,11 @@ def _columns(lines: list[str], skipped: int) -> dict[str, Array]:
     return {name: values[:, j] for j, name in enumerate(names)}
 
 
+def _shown(cell: str) -> str:
+    """A cell for a message; one of a file that is no table may be as long as that."""
+    return repr(cell if len(cell) <= SHOWN else f"{cell[:SHOWN]}...")
+
+
 def _numbers(names: Iterable[str], cells: Iterable[str], line: int) -> list[float]:
     """One row; NaN where a cell is empty."""
     values = []
@@ -73,10 +87,13 @@ def _numbers(names: Iterable[str], cells: Iterable[str], line: int) -> list[floa
         try:
             value = float(cell.replace("_", "?")) if cell.strip() else None
         except ValueError as error:
-            raise InputError(f"line {line}, column {name!r}: {cell!r} is no number") from error
+            raise InputError(
+                f"line {line}, column {_shown(name)}: {_shown(cell)} is no number"
+            ) from error
         if value is not None and not np.isfinite(value):
             raise InputError(
-                f"line {line}, column {name!r}: {cell!r} is not finite; leave a missing cell empty"
+                f"line {line}, column {_shown(name)}: {_shown(cell)} is not finite; leave a "
+                "missing cell empty"
             )
         values.append(np.nan if value is None else value)
     return values

@@ -30,6 +30,7 @@ from pup.importers.common import (
     item,
     join,
     joint_columns,
+    opened,
     parse_json,
 )
 from pup.recording import Recording, from_columns
@@ -101,6 +102,11 @@ def read(path: Path, options: ImportOptions) -> list[Recording]:
 def _pick(topics: list[Topic], state: str | None, command: str | None) -> tuple[Topic, Topic]:
     """The topics of readings and of commands, which by default has such a word in its name."""
     names = [topic.name for topic in topics]
+    if len(names) == 1:
+        raise InputError(
+            f"of JointState topics there is only {names[0]}: readings and commands are on two; "
+            "record both"
+        )
     by_word = [n for n in names if any(word in n.lower() for word in COMMAND_WORDS) and n != state]
     if command is None and len(by_word) == 1:
         command = by_word[0]
@@ -264,7 +270,7 @@ def _records(path: Path) -> Iterator[Any]:
     if path.stat().st_size > MAX_FILE:
         raise InputError(f"larger than {MAX_FILE} bytes; cut the log")
     unpacked = 0
-    with path.open("rb") as file:
+    with opened(path) as file:
         reader = StreamReader(
             file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_FILE
         )

@@ -22,6 +22,7 @@ from pup.importers.common import (
     ImportOptions,
     finite,
     join,
+    opened,
     parse_json,
 )
 from pup.recording import Recording, from_columns
@@ -76,6 +77,8 @@ def _signals(
             raise InputError(
                 f"'{kind}_data' has {data.shape[1]} unnamed columns; name as many with --joints"
             )
+        if len(set(joints)) < len(joints):
+            raise InputError(f"--joints {','.join(joints)}: names a joint twice; name each once")
         return time, {name: data[:, j] for j, name in enumerate(joints)}
     mapping = parse_json(str(encoded))
     if not isinstance(mapping, dict) or not mapping:
@@ -95,7 +98,7 @@ def _signals(
 def _load(path: Path) -> dict[str, Any]:
     """The arrays of the layout; their sizes are judged by their headers before they are read."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with opened(path) as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             if len(members) > MAX_MEMBERS or sum(m.file_size for m in members) > MAX_UNPACKED:
                 raise InputError(
@@ -104,7 +107,7 @@ def _load(path: Path) -> dict[str, Any]:
                 )
             for member in members:
                 _check_header(archive, member)
-        with np.load(path, allow_pickle=False) as arrays:
+        with opened(path) as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except InputError:
         raise

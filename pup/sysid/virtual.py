@@ -18,6 +18,7 @@ from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.simulator import Trajectories
 from pup.physics.terms import split_column
 from pup.recording import Recording, write_recordings
+from pup.recording_file import read_header
 from pup.robot import RobotDescription
 from pup.script import FALLEN
 from pup.sysid.excitation import Motion, joint_units, script
@@ -223,6 +224,14 @@ def _measured(
     )
 
 
+def _simulated(file: Path) -> bool:
+    """Whether a file is of a virtual robot, which can be recorded again, unlike a real one."""
+    try:
+        return bool(read_header(file).metadata["source"] == "simulation")
+    except InputError:
+        return False
+
+
 def record(
     robot: RobotDescription,
     kinds: Sequence[str],
@@ -240,7 +249,8 @@ def record(
     Args:
       robot: the robot.
       kinds: what it plays, as in `script`.
-      folder: where the files go; it may hold no recordings but those written again.
+      folder: where the files go; it may hold no recordings but those of a virtual robot that are
+        written again.
       seed: of everything random. Parameters, scripts and noise are drawn independently: other
         motions under the same seed are those of the same robot.
       actuator: its torque law, `nn_pd` or `pd`.
@@ -258,7 +268,8 @@ def record(
     motions = script(robot, kinds, scripted, jitter)
     recordings = record_virtual(robot, motions, actuator, parameters, sensed, noise, repeats)
     names = {f"{recording.id}.parquet" for recording in recordings}
-    others = sorted(path.name for path in folder.glob("*.parquet") if path.name not in names)
+    found = sorted(folder.glob("*.parquet"))
+    others = [file.name for file in found if file.name not in names or not _simulated(file)]
     if others:
         raise InputError(f"{folder}: holds other recordings ({others[0]}); use an empty folder")
     write_recordings(recordings, folder)
