@@ -34,7 +34,8 @@ class Body:
       robot: its description, with a servo for every joint.
 
     Raises:
-      InputError: a joint has no servo, or one that is mounted as none of this robot can be.
+      InputError: a joint has no servo, or one that is mounted as none of this robot can be, or
+        the board has a servo's id.
     """
 
     def __init__(self, settings: Settings, robot: RobotDescription) -> None:
@@ -45,6 +46,10 @@ class Body:
             lacking = self.names[ids.index(None)]
             raise InputError(f"{robot.folder / 'robot.toml'}: joint {lacking!r} has no servo_id")
         self.ids = [number for number in ids if number is not None]
+        board = settings.bus.board
+        if board and board in self.ids:  # what makes a board give current makes a servo hold
+            joint = self.names[self.ids.index(board)]
+            raise InputError(f"bus.board: {board} is the servo of {joint}; a CM-740 has 200")
         self.imu = imu_of(settings.imu)
         self._robot = robot
         mountings = _mountings(settings.bus, robot)
@@ -188,6 +193,8 @@ class Body:
         if stale.any() or np.isnan(senses.position).any() or blind:
             silent = ", ".join(self.names[j] for j in np.flatnonzero(stale)[:3]) or "the IMU"
             return Trip("enable", f"the pose is not known: {silent} does not answer")
+        if beyond := self._beyond(senses.position):
+            return Trip("enable", beyond)
         self.guard.reset()
         self._doubt()  # from here on, whatever comes of it; some come on by a goal alone
         self.goal, self._written = senses.position.copy(), senses.time
@@ -201,6 +208,19 @@ class Body:
         self.torque = True
         self._doubted.clear()
         return None
+
+    def _beyond(self, position: Array) -> str:
+        """Which joint is where its servo cannot be told to stay, in words; empty for none.
+
+        It would go to the end of what the servo takes, at once and at full speed.
+        """
+        least, largest = self.bus.reach.T
+        for j in np.flatnonzero((position < least - MISSED) | (position > largest + MISSED)):
+            return (
+                f"{self.names[j]} is at {position[j]:.2f} rad, and servo {self.ids[j]} takes "
+                f"{least[j]:.2f} to {largest[j]:.2f} rad only; turn it back by hand"
+            )
+        return ""
 
     def command(self, target: Array, now: float) -> Applied | Trip:
         """Send a target, as far as the limits let it.

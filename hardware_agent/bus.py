@@ -15,7 +15,7 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from numpy.typing import NDArray
 
 from hardware_agent.config import BusSettings
-from hardware_agent.keeping import kept, put_right
+from hardware_agent.keeping import MODEL, kept, put_right
 from hardware_agent.line import Line
 from hardware_agent.mounting import Mounting
 from hardware_agent.plausible import Plausible
@@ -105,10 +105,12 @@ class Bus(Line):
         if self.settings.board:
             self._switch_on(self.settings.board)
         self.torque(False)
-        missing = [name for name in self.ids if self.register(name, (0, 2)) is None]
+        missing = [name for name in self.ids if self.register(name, MODEL) is None]
         if missing:
-            told = ", ".join(map(str, missing))
-            raise BusError(f"{self.settings.port}: no answer from servo {told}")
+            told, how = ", ".join(map(str, missing)), self.settings
+            known = f"; do they have current, baud {how.baud} and protocol {how.protocol}?"
+            hint = known if len(missing) == len(self.ids) else ""
+            raise BusError(f"{how.port}: no answer from servo {told}{hint}")
         changed = [told for name in self.ids for told in put_right(self, name)]
         for name in self.ids:
             own = kept(self, name)
@@ -318,7 +320,10 @@ class Bus(Line):
         """Let the board give the servos current."""
         power = self._current(board)
         if power is None:
-            raise BusError(f"{self.settings.port}: no answer from the board, id {board}")
+            raise BusError(
+                f"{self.settings.port}: no answer from the board, id {board}; does it have current "
+                f"and baud {self.settings.baud}?"
+            )
         if power != ON:
             with self._told():
                 PacketHandler(1.0).writeTxRx(self._use(), board, *BOARD_POWER, list(ON))

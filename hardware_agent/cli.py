@@ -37,6 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"pup-agent {options.verb}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return REFUSED
+    except OSError as error:  # of the storage: it may pass
+        print(f"pup-agent {options.verb}: {' '.join(str(error).splitlines())}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         return FAILED
 

@@ -4,6 +4,7 @@ accepted → (enabled, cool, and let start by whoever stands there) armed → st
 feet → settled → written down as running → walking → ended → distance → finished.
 """
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +17,7 @@ import numpy as np
 from hardware_agent.activities import Ended, Posed, Settled, TrialEvent, Walked
 from hardware_agent.config import Settings
 from hardware_agent.distance import Distance, DistanceError, check_typed
+from hardware_agent.journal import JournalError
 from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.recordings import Recordings
@@ -34,7 +36,10 @@ from pup.wire import (
     Sample,
 )
 
+log = logging.getLogger("pup-agent")
+
 SAMPLES = 0.2  # s between two samples
+AGAIN = 2.0  # s between two tries to write an end down
 LONGEST = 600.0  # s, of a walk
 COOL = "cool"  # what a trial waits for while a winding is hot
 
@@ -49,6 +54,7 @@ class Stage(StrEnum):
     SETTLING = "settling"
     RUNNING = "running"
     MEASURING = "measuring"
+    ENDING = "ending"
 
 
 MOVED = (Stage.POSING, Stage.PLACING, Stage.SETTLING, Stage.RUNNING)
@@ -92,8 +98,9 @@ class Conductor:
         self._armed = False
         self._future: Future[Any] | None = None
         self._end: End | None = None  # of a motion that is over
+        self._unkept: np.ndarray | None = None  # rows of its recording, where no disk took them
         self._doubted: float | None = None
-        self._sampled = 0.0
+        self._sampled = self._written = 0.0
         if (left := book.unmeasured) is not None:  # it walked before the agent was started anew
             self._assign, self._end = left
             self._ask()
@@ -121,7 +128,7 @@ class Conductor:
         Raises:
           InputError: there is none that could be skipped.
         """
-        if self._assign is None or self.stage is Stage.RUNNING:
+        if self._assign is None or self.stage in (Stage.RUNNING, Stage.ENDING):
             raise InputError("no trial can be skipped now; `pup-agent stop` stops one that runs")
         if self.stage is Stage.MEASURING or self.stage is Stage.WAITING:
             self._finish(Outcome.ABORTED, reason)
@@ -149,7 +156,12 @@ class Conductor:
 
     def cancelled(self, cancel: Cancel) -> None:
         """The gateway takes a trial back."""
-        answers, end = self._book.cancelled(cancel)
+        try:
+            answers, end = self._book.cancelled(cancel)
+        except JournalError:  # the robot stops for it all the same; the rest is told again
+            if self._assign is not None and _key(cancel) == _key(self._assign):
+                self._motion.cancel("cancelled")
+            raise
         self._send(*answers)
         if not end or self._assign is None or _key(cancel) != _key(self._assign):
             return
@@ -186,6 +198,8 @@ class Conductor:
         self._motion.hurry(self.stage is Stage.WAITING and self.waiting == COOL)
         if self._future is not None and self._future.done():
             self._collect(self._future)
+        if self.stage is Stage.ENDING and time.monotonic() - self._written > AGAIN:
+            self._write_down()
 
     def told(self, finished: Finished) -> list[Body]:
         """How a trial ended, as the gateway is told: its recording in pieces, then the end."""
@@ -205,7 +219,7 @@ class Conductor:
             self._rollout = Rollout(policy, assign.eta, self._settings.control.rate)
             self._direction = policy.card.direction
             self._check(assign, policy.card.observation)
-        except InputError as error:
+        except (InputError, OSError) as error:  # storage that fails must drop no robot either
             self._finish(Outcome.ABORTED, str(error))
             return
         self.stage, self._armed = Stage.WAITING, False
@@ -255,7 +269,11 @@ class Conductor:
         if not self._mine(self._book.current):
             self._motion.cancel("taken back")
             return
-        self._send(self._book.begin(self._assign))
+        try:
+            self._send(self._book.begin(self._assign))
+        except JournalError as error:  # a walk that is not written down could be walked twice
+            self._motion.cancel(str(error))
+            return
         self._recordings.flight.begin(self._assign)
         self.stage = Stage.RUNNING
         self._motion.go(self._assign)
@@ -279,14 +297,27 @@ class Conductor:
         ended = event.outcome is Outcome.SUCCEEDED
         if ended and not self._distance.asks:
             self.stage, self._future = Stage.MEASURING, self._hands.submit(self._distance.end)
-        rows = np.array([row.values for row in event.rollout.rows])
-        kept = self._recordings.keep(event.assign, rows, event.reason) or (None, None)
-        self._end = End(event.outcome, event.reason, None, event.time, *kept)
+        self._unkept = np.array([row.values for row in event.rollout.rows])
+        self._end = self._with_recording(End(event.outcome, event.reason, None, event.time))
         if not ended:
             self._finish(event.outcome, event.reason)
         elif self._distance.asks:
-            self._book.walked(event.assign, self._end)  # before anybody goes for the tape
+            try:
+                self._book.walked(event.assign, self._end)  # before anybody goes for the tape
+            except JournalError as error:  # then the distance has to come before a restart
+                log.error("%s", error)
             self._ask()
+
+    def _with_recording(self, end: End) -> End:
+        """The end with its recording, where there is one and the disk takes it now."""
+        assert self._assign is not None
+        if self._unkept is None:
+            return end
+        kept = self._recordings.keep(self._assign, self._unkept, end.reason)
+        if kept is None:
+            return end
+        self._unkept = None
+        return replace(end, recording=kept[0], digest=kept[1])
 
     def _ask(self) -> None:
         """Have somebody tell how far the robot came."""
@@ -306,21 +337,44 @@ class Conductor:
             self.stage = Stage.SETTLING
             self._motion.placed(self._assign, cold=self._settings.distance.renew)
         elif self.stage is Stage.MEASURING:
-            assert self._end is not None
+            self._believe(told)
+
+    def _believe(self, told: float) -> None:
+        """End the trial with the distance of a program; one in millimetres, say, never counts."""
+        assert self._end is not None and self._assign is not None
+        try:
+            check_typed(told, self._end.time or 0.0, self._assign.horizon, sure=True)
+        except InputError as error:
+            self._finish(Outcome.ABORTED, str(error))
+        else:
             self._finish(Outcome.SUCCEEDED, self._end.reason, told)
 
     def _finish(self, outcome: Outcome, reason: str, distance: float | None = None) -> None:
-        assert self._assign is not None
         walked = self._end or End(outcome, reason)
-        end = replace(walked, outcome=outcome, reason=reason, distance=distance)
-        finished = self._book.finish(self._assign, end)
+        self._end = replace(walked, outcome=outcome, reason=reason, distance=distance)
+        self.stage, self.waiting = Stage.ENDING, "journal"
+        self._write_down()
+
+    def _write_down(self) -> None:
+        """Write the trial's end down, and only then tell it; again later where that fails.
+
+        The robot stays as it is meanwhile: it stands, and nobody may be holding it.
+        """
+        assert self._assign is not None and self._end is not None
+        self._written = time.monotonic()
+        self._end = self._with_recording(self._end)
+        try:
+            finished = self._book.finish(self._assign, self._end)
+        except JournalError as error:
+            log.error("%s; the end of %s waits for it", error, self._assign.trial)
+            return
         self._send(*self.told(finished))
         self._reset()
         self._motion.measured()
 
     def _reset(self) -> None:
         self.stage, self.waiting = Stage.NONE, ""
-        self._assign = self._rollout = self._end = self._future = None
+        self._assign = self._rollout = self._end = self._future = self._unkept = None
         self._armed, self._doubted = False, None
 
     def _mine(self, current: Assign | None) -> bool:

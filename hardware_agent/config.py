@@ -17,7 +17,7 @@ from pup.errors import InputError
 from pup.robot_toml import Table, read_text
 
 LIMIT = 2**18  # bytes
-ADDRESS = re.compile(r"tcp://[^\s*]+:\d+")
+ADDRESS = re.compile(r"tcp://[^\s*/]+:0*(\d{1,5})")
 AXIS = re.compile(r"[+-]?[xyz]")
 
 
@@ -277,7 +277,25 @@ PARTS: dict[str, type[Any]] = {
 
 def _path(table: Table, key: str, file: Path) -> Path:
     """A path; one that is relative counts from the configuration."""
-    return (file.parent / Path(table.text(key)).expanduser()).absolute()
+    told = table.text(key)
+    try:
+        return located(told, file)
+    except ValueError as error:
+        raise table.mistake(key, f"{told!r}: {error}; write the path in full") from error
+
+
+def located(told: str, file: Path) -> Path:
+    """Where a path of a configuration leads.
+
+    Raises:
+      ValueError: it cannot lead anywhere.
+    """
+    if "\0" in told:
+        raise ValueError("no path has a zero in it")
+    try:
+        return (file.parent / Path(told).expanduser()).absolute()
+    except RuntimeError as error:  # ~ of somebody who is not there
+        raise ValueError("there is no such user here") from error
 
 
 def _part(table: Table, kind: type[Any]) -> Any:
@@ -315,7 +333,11 @@ def _value(table: Table, key: str, hint: Any) -> Any:
     if get_args(hint)[0] is str:
         return table.texts(key)
     values = table.numbers(key)
-    return tuple(map(int, values)) if get_args(hint)[0] is int else values
+    if get_args(hint)[0] is not int:
+        return values
+    if not all(value.is_integer() for value in values):
+        raise table.mistake(key, "expected whole numbers")
+    return tuple(map(int, values))
 
 
 def _mistakes(part: Any) -> Any:
@@ -357,7 +379,8 @@ def _mistakes(part: Any) -> Any:
         if part.kind == "virtual" and not part.side:
             yield "side", "missing; write the --side of `pup virtual-robot`"
     if isinstance(part, LinkSettings) and part.gateway:
-        if not ADDRESS.fullmatch(part.gateway):
+        told = ADDRESS.fullmatch(part.gateway)
+        if told is None or not 1 <= int(told[1]) <= 65535:
             yield "gateway", f"{part.gateway!r}; write tcp://HOST:PORT"
         for key in ("key", "gateway_key"):
             if not getattr(part, key):
@@ -372,3 +395,10 @@ def check_together(settings: Settings, file: Path) -> None:
     """
     if settings.imu.kind == "cm740" and not settings.bus.board:
         raise InputError(f'{file}: imu.kind: "cm740" is the board\'s; write its id as bus.board')
+    rate, late, timeout = settings.control.rate, settings.safety.late, settings.watchdog.timeout
+    for key, limit in (("safety.late", late), ("watchdog.timeout", timeout)):
+        if limit * rate <= 1:
+            raise InputError(
+                f"{file}: {key}: at {rate:g} Hz (control.rate) a command comes every "
+                f"{1 / rate:.3f} s only; {limit:g} s stops every robot that is enabled"
+            )

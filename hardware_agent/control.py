@@ -41,7 +41,7 @@ class ControlServer(threading.Thread):
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.exists():
+            if path.is_socket():  # left behind, perhaps; anything else is somebody's file
                 with suppress(Unreachable):
                     say(path, {"do": "health"})
                     raise InputError(f"{path}: another agent listens there; end it first")

@@ -22,7 +22,7 @@ from hardware_agent.config import Settings
 from hardware_agent.control import ControlServer
 from hardware_agent.distance import distance_of
 from hardware_agent.health import health
-from hardware_agent.journal import Journal
+from hardware_agent.journal import Journal, JournalError, own
 from hardware_agent.link import Link
 from hardware_agent.link_thread import LinkThread
 from hardware_agent.motion import LATE, Motion
@@ -95,7 +95,9 @@ class Agent:
         self._robot = RobotDescription.load(settings.robot)
         self._body = RobotBody(settings, self._robot)
         self._recordings = Recordings(settings.state, self._robot, settings.control.source)
-        self._book = TrialBook(Journal(settings.state / "journal"), self._recordings.salvage)
+        self._owned = own(settings.state)  # before what another agent may be writing is read
+        self._journal = Journal(settings.state / "journal")
+        self._book = TrialBook(self._journal, self._recordings.salvage)
         self._warmth = Warmth(settings.state / "warmth", settings.safety.current_time)
         self._body.guard.warm(self._warmth.left())
         self._shelf = Shelf(settings.policies, self._robot)
@@ -187,6 +189,8 @@ class Agent:
         """See `hardware_agent.health`."""
         link = None if self._link is None else self._link.connected
         told = health(self._settings, self._motion.status, self._watchdog.alive(), link)
+        if self._journal.trouble:
+            told["problems"].append(self._journal.trouble)
         conductor = self._conductor
         return told | {
             "robot": self._robot.name,
@@ -223,7 +227,11 @@ class Agent:
             self._send(*self._hello())
             self._beaten = 0.0  # a hello tells no state
         while not self._heard.empty():
-            self._receive(self._heard.get())
+            message = self._heard.get()
+            try:
+                self._receive(message)
+            except JournalError as error:  # neither done nor answered; the gateway tells it again
+                log.error("%s: not taken: %s", type(message.body).__name__, error)
         while not self._events.empty():
             event = self._events.get()
             if isinstance(event, Ready | Played):

@@ -50,13 +50,13 @@ def distance_of(settings: DistanceSettings) -> Distance:
 
 
 def check_typed(distance: float, walked: float, horizon: float, sure: bool) -> None:
-    """Refuse a distance that somebody mistyped, in centimetres say.
+    """Refuse a distance that somebody mistyped, in centimetres say, or a program told so.
 
     Args:
-      distance: that was typed, m.
+      distance: that was told, m.
       walked: time until the fall or the end, s.
       horizon: longest walk, s.
-      sure: whether it was typed before, and doubted.
+      sure: whether nobody is to be asked again: it was typed before, or a program tells it.
 
     Raises:
       InputError: no robot comes so far, or hardly one.

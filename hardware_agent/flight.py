@@ -7,7 +7,6 @@ The next walk takes its place.
 
 import json
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -45,13 +44,15 @@ class FlightRecorder:
 
     def __init__(self, file: Path, joints: Sequence[str]) -> None:
         self._file, self._width = file, len(row_names(joints))
-        self._kept = 0
+        self._kept, self._lost = 0, False
 
     def begin(self, assign: Assign) -> None:
         """A walk begins."""
-        self._kept = 0
-        with suppress(OSError):
+        self._kept, self._lost = 0, False
+        try:
             self._file.write_bytes(json.dumps(asdict(assign)).encode() + b"\n")
+        except OSError:
+            self._lost = True
 
     def keep(self, rows: Sequence[Row]) -> None:
         """Add what is new.
@@ -61,9 +62,13 @@ class FlightRecorder:
         """
         new = rows[self._kept :]
         self._kept += len(new)
-        if new:
-            with suppress(OSError), self._file.open("ab") as file:
+        if not new or self._lost:
+            return
+        try:
+            with self._file.open("ab") as file:
                 file.write(np.array([row.values for row in new]).tobytes())
+        except OSError:  # it ends here: what came behind half a row could not be told from it
+            self._lost = True
 
     def left(self) -> Flight | None:
         """The latest walk, as far as it can be read."""

@@ -119,7 +119,8 @@ class Uart:
     def take(self, length: int) -> bytes | None:
         """Its answer; None for a refusal, which a busy chip gives now and then, or silence."""
         answer = self._receive(length + 2)
-        return answer[2:] if answer[:2] == bytes([0xBB, length]) else None
+        whole = len(answer) == length + 2 and answer[:2] == bytes([0xBB, length])
+        return answer[2:] if whole else None
 
     def _send(self, data: bytes) -> None:
         self._port.reset_input_buffer()

@@ -4,10 +4,13 @@ A line of JSON per entry, with a checksum. A last line that was torn by a power 
 upon, so it is cut off; damage anywhere else is told and nothing is run.
 """
 
+import errno
+import fcntl
 import json
 import os
 import time
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +20,50 @@ from pup.files import MISTAKES
 SCHEMA = 1
 
 
+class JournalError(OSError):
+    """The journal does not take an entry, which so never was; told in one line."""
+
+
+def own(folder: Path) -> int:
+    """Become the only agent whose files are in a folder; it is made when absent.
+
+    Returns:
+      A file descriptor: the folder is owned until it is closed, or the process ends.
+
+    Raises:
+      InputError: another agent owns it, or it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        owned = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except MISTAKES as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+    try:
+        fcntl.flock(owned, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(owned)
+        raise InputError(
+            f"{folder}: another agent's journal is there; end it first, or set another state"
+        ) from error
+    return owned
+
+
 class Journal:
     """A file of entries.
+
+    Attributes:
+      trouble: why the latest entry was not taken; empty where it was.
 
     Args:
       file: made when absent.
 
     Raises:
       InputError: the file is damaged, of another version, or cannot be where it is to be.
+      JournalError: it is new, and the disk takes nothing.
     """
 
     def __init__(self, file: Path) -> None:
-        self.file = file
+        self.file, self.trouble = file, ""
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             fresh = not file.exists()
@@ -47,15 +82,23 @@ class Journal:
 
         Args:
           entry: of JSON values; its time is added.
+
+        Raises:
+          JournalError: the disk does not take it.
         """
         text = json.dumps(entry | {"at": time.time()}, allow_nan=False, separators=(",", ":"))
         line = f"{zlib.crc32(text.encode()):08x} {text}\n".encode()
         before = os.fstat(self._handle).st_size
-        written = os.write(self._handle, line)
-        if written != len(line):
-            os.ftruncate(self._handle, before)  # what comes next is not to stand behind a torn line
-            raise OSError(f"{self.file}: the disk is full")
-        os.fsync(self._handle)
+        try:
+            if os.write(self._handle, line) != len(line):
+                raise OSError(errno.ENOSPC, "the disk is full")
+            os.fsync(self._handle)
+        except OSError as error:
+            with suppress(OSError):  # what comes next is not to stand behind a torn line
+                os.ftruncate(self._handle, before)
+            self.trouble = f"{self.file}: cannot be written ({error.strerror})"
+            raise JournalError(self.trouble) from error
+        self.trouble = ""
 
     def close(self) -> None:
         """Close the file."""

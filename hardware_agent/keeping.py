@@ -7,6 +7,9 @@ from hardware_agent.port import BusError
 from hardware_agent.registers import POSITION
 from pup.errors import InputError
 
+MODEL = (0, 2)
+"""Where every servo and board has its model number."""
+
 
 @dataclass(frozen=True)
 class Kept:
@@ -34,10 +37,16 @@ def put_right(line: Line, name: int) -> list[str]:
 
     Raises:
       BusError: it does not take a setting.
-      InputError: it is of another model.
+      InputError: it is of another model, or an adapter echoes.
     """
     own, where = line.registers, f"{line.settings.port}: servo {name}"
-    model = line.register(name, (0, 2))
+    model = line.register(name, MODEL)
+    if own.protocol == 1 and model == int.from_bytes(bytes(MODEL), "little"):
+        # With Protocol 1.0 a question that comes back passes for an answer: address and length.
+        raise InputError(
+            f"{line.settings.port}: what is sent to servo {name} comes back as its answer; switch "
+            "the adapter's echo off, or use one that has none"
+        )
     if model != own.model:
         raise InputError(
             f"{where} is of model {model}, not an MX-28 with Protocol {own.protocol}.0 "

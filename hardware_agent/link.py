@@ -6,6 +6,7 @@ for a connection proves nothing about the programs at its ends.
 """
 
 import logging
+import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import zmq
 import zmq.auth
+from zmq.utils import z85
 
 from hardware_agent.config import LinkSettings
 from pup.errors import InputError
@@ -158,4 +160,14 @@ def _key(path: str, secret: bool) -> tuple[bytes, bytes | None]:
         raise InputError(f"{path}: not a CURVE key file ({error}); see docs/agent.md") from error
     if secret and private is None:
         raise InputError(f"{path}: has no secret key; link.key is the file *.key_secret")
+    if not _whole(public) or (private is not None and not _whole(private)):
+        raise InputError(f"{path}: a key in it is damaged or cut off; copy the file again")
     return public, private
+
+
+def _whole(key: bytes) -> bool:
+    """Whether ZeroMQ takes a key: 40 characters of Z85."""
+    try:
+        return len(key) == 40 and len(z85.decode(key)) == 32
+    except (ValueError, KeyError, struct.error):
+        return False

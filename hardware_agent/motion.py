@@ -4,6 +4,7 @@ Read all sensors, ask the rules of safety, ask the activity for a target, send i
 """
 
 import gc
+import logging
 import time
 from collections.abc import Callable
 
@@ -36,6 +37,8 @@ from hardware_agent.watchdog import Watchdog
 from pup.errors import InputError
 from pup.script import Script
 from pup.wire import AgentState, Assign, Outcome
+
+log = logging.getLogger("pup-agent")
 
 REOPEN = 1.0  # s between tries to find a bus that is gone
 LATE = Refused("the robot was stopped meanwhile; ask again")
@@ -237,11 +240,16 @@ class Motion(Loop):
         """Look for a bus that is gone; requests that come meanwhile time out."""
         self.status = self._told(None)
         try:
-            self._body.open()
+            told = self._body.open()
         except (BusError, InputError) as error:
             self._reason = f"bus: {error}"
+            self.status = self._told(None)
             self._wake.wait(REOPEN)
             return False
+        for line in told:
+            log.info("%s", line)
+        if self._state is AgentState.DISABLED:  # nothing was stopped: the robot was switched on
+            self._reason = ""
         self._bus = True
         return True
 

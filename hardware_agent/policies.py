@@ -73,6 +73,10 @@ class Shelf:
                 log.warning("%s; left out", error)
 
     def _bundles(self) -> list[Path]:
-        if (self._folder / CARD).is_file():
-            return [self._folder]
-        return sorted(file.parent for file in self._folder.glob(f"*/{CARD}"))
+        try:
+            if (self._folder / CARD).is_file():
+                return [self._folder]
+            return sorted(file.parent for file in self._folder.glob(f"*/{CARD}"))
+        except OSError as error:  # a folder that the service's user may not look into, say
+            log.warning("%s: cannot be read (%s)", self._folder, error.strerror)
+            return []

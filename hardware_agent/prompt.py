@@ -118,8 +118,10 @@ def _measure(agent: Talk, trial: str) -> None:
             agent.say({"do": "distance", "distance": metres, "trial": trial})
         else:
             agent.say({"do": "skip", "reason": "not measured"})
-    except (InputError, ValueError) as error:
+    except InputError as error:
         print(error)
+    except ValueError:
+        print(f"{typed!r} is no number of metres; 30 cm are 0.3")
 
 
 def key_pressed() -> str:

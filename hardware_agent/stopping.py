@@ -11,7 +11,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hardware_agent.config import Settings
+from hardware_agent.config import Settings, located
 from hardware_agent.control import Unreachable, say
 from pup.errors import InputError
 
@@ -59,10 +59,9 @@ def make_limp(file: Path, verb: str) -> bool:
 
 def sockets(file: Path) -> list[Path]:
     """Where the agent may listen whose configuration has a mistake, likeliest first."""
-    text = ""
-    with suppress(OSError):
-        text = file.read_text(errors="replace")
-    told = [(file.parent / Path(path).expanduser()).absolute() for path in TOLD.findall(text)]
+    told: list[Path] = []
+    with suppress(OSError, ValueError):  # a path that leads nowhere may be the mistake
+        told = [located(path, file) for path in TOLD.findall(file.read_text(errors="replace"))]
     return [*told[:1], SOCKET]
 
 

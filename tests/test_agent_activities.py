@@ -64,6 +64,14 @@ def test_a_bundle_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
     assert told.name == "still" and shelf.load(told.sha256)
 
 
+def test_a_folder_of_bundles_that_cannot_be_looked_into_is_empty(tmp_path: Path) -> None:
+    """Of another user, or with a name beyond what the file system knows: no robot falls for it."""
+    shelf = Shelf(tmp_path / ("p" * 300), STANDS)
+    assert shelf.policies() == ()
+    with pytest.raises(InputError, match="no policy with digest"):
+        shelf.load("0" * 64)
+
+
 def test_a_policy_of_another_description_is_refused_or_told_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

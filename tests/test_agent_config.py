@@ -4,10 +4,12 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from agents import CONFIG, changed
+from agents import CONFIG, DARWIN, changed
 
+from hardware_agent.body import Body
 from hardware_agent.cli import main
-from hardware_agent.config import SafetySettings, Settings
+from hardware_agent.config import SafetySettings, Settings, check_together
+from hardware_agent.control import ControlServer
 from hardware_agent.journal import Journal
 from pup.errors import InputError
 
@@ -49,6 +51,7 @@ MISTAKES = {
     ),
     "two gains": ("[bus]\ngains = [32, 16]", "bus.gains: write P, I and D"),
     "a gain too large": ("[bus]\ngains = [850, 0, 0]", "bus.gains: write P, I and D"),
+    "half a gain": ("[bus]\ngains = [32.5, 0, 16]", "bus.gains: expected whole numbers"),
     "a half turn": ("[bus.joints.l_knee]\nsign = 0", "bus.joints.l_knee.sign: 0; use one of 1, -1"),
     "a sign in words": ('[bus.joints.l_knee]\nsign = "-"', "l_knee.sign: expected a whole number"),
     "a zero beyond the servo": (
@@ -77,6 +80,14 @@ MISTAKES = {
         'control.clock: a real robot\'s time does not stand still; "lockstep" needs source',
     ),
     "no hook": ('[distance]\nkind = "hook"', "distance.command: missing"),
+    "a port that is none": (
+        '[link]\nkey = "a"\ngateway_key = "b"\ngateway = "tcp://a:84711"',
+        "link.gateway: 'tcp://a:84711'; write tcp://HOST:PORT",
+    ),
+    "an address of a page": (
+        '[link]\nkey = "a"\ngateway_key = "b"\ngateway = "tcp://a/v1:8471"',
+        "link.gateway: 'tcp://a/v1:8471'; write tcp://HOST:PORT",
+    ),
     "a gateway without keys": ('[link]\ngateway = "tcp://a:1"', "link.key: missing"),
     "an odd gateway": (
         '[link]\nkey = "a"\ngateway_key = "b"\ngateway = "http://a"',
@@ -91,6 +102,48 @@ def test_a_mistake_is_told_in_one_line(tmp_path: Path, more: str, told: str) -> 
         read(tmp_path, changed(WHOLE, more))
     assert told in str(refused.value) and "\n" not in str(refused.value)
     assert "agent.toml" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [("~nobody-here/x", "there is no such user here"), ("a\\u0000b", "no path has a zero in it")],
+)
+def test_a_path_that_leads_nowhere_is_told_and_does_not_keep_a_stop_from_being_tried(
+    tmp_path: Path, place: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for key in ("state", "policies", "socket"):
+        text = WHOLE.replace(f'{key} = "', f'{key} = "{place}', 1)
+        with pytest.raises(InputError, match=f"agent.toml: {key}: .*{told}"):
+            read(tmp_path, text)
+        assert main(["stop", "--config", str(tmp_path / "agent.toml")]) == 2
+        assert "no servo was told anything: use the power switch" in capsys.readouterr().err
+
+
+def test_a_rate_that_the_limits_do_not_allow_is_refused(tmp_path: Path) -> None:
+    """Else the robot would be stopped, or its agent killed, as soon as it is enabled."""
+    for more, told in (
+        ("[control]\nrate = 5\n[safety]\nlate = 0.15", "safety.late: at 5 Hz"),
+        ("[control]\nrate = 10\n[watchdog]\ntimeout = 0.1", "watchdog.timeout: at 10 Hz"),
+    ):
+        settings = read(tmp_path, changed(WHOLE, more))
+        with pytest.raises(InputError, match=told):
+            check_together(settings, tmp_path / "agent.toml")
+    check_together(read(tmp_path, WHOLE), tmp_path / "agent.toml")
+
+
+def test_a_board_with_the_id_of_a_servo_is_refused(tmp_path: Path) -> None:
+    """What makes a board give its servos current is what makes a servo hold."""
+    with pytest.raises(InputError, match=r"bus.board: 20 is the servo of head_tilt; a CM-740"):
+        Body(read(tmp_path, changed(WHOLE, "[bus]\nboard = 20")), DARWIN)
+    Body(read(tmp_path, changed(WHOLE, "[bus]\nboard = 0")), DARWIN)
+
+
+def test_a_file_in_the_sockets_place_is_left_alone(tmp_path: Path) -> None:
+    mine = tmp_path / "journal"
+    mine.write_text("mine")
+    with pytest.raises(InputError, match="no socket can be made there"):
+        ControlServer(mine, lambda _: {}, lambda: None)
+    assert mine.read_text() == "mine"
 
 
 @pytest.mark.parametrize("verb", ["run", "enable", "health", "disable", "stop"])

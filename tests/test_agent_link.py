@@ -1,5 +1,6 @@
 """The link: known by its key, made anew when it is silent, unmoved by what is no message."""
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -106,6 +107,27 @@ def test_a_key_that_is_none_is_told(tmp_path: Path) -> None:
                 LinkSettings("tcp://a:1", str(tmp_path / key), str(tmp_path / "gateway.key")),
                 lambda: None,
             )
+
+
+@pytest.mark.parametrize("damage", [lambda key: key[:10], lambda key: "~" + key[1:]])
+def test_a_key_that_was_badly_copied_is_told_before_anything_starts(
+    tmp_path: Path, damage: Callable[[str], str]
+) -> None:
+    """ZeroMQ takes it for a mistake of the program, and the link would end with it."""
+    keys(tmp_path)
+    for name, line in (("agent.key_secret", "secret-key"), ("gateway.key", "public-key")):
+        file = tmp_path / name
+        sound = file.read_text()
+        (key,) = re.findall(f'{line} = "(.{{40}})"', sound)
+        file.write_text(sound.replace(key, damage(key)))
+        with pytest.raises(InputError, match=f"{name}: a key in it is damaged or cut off"):
+            Link(
+                LinkSettings(
+                    "tcp://a:1", str(tmp_path / "agent.key_secret"), str(tmp_path / "gateway.key")
+                ),
+                lambda: None,
+            )
+        file.write_text(sound)
 
 
 def test_nothing_waits_for_a_gateway_that_is_not_there(tmp_path: Path) -> None:

@@ -93,6 +93,8 @@ def test_keys_stop_while_a_distance_is_typed_and_so_does_a_terminal_that_is_lost
         made.until("stopped")
         os.write(keys, b"2\r")  # 0.62 m in 0.4 s: is that so?
         assert any(b"0.62 m in a walk of 0.4 s is far" in line for line in printed)
+        os.write(keys, b"0.6.2\r")
+        assert any(b"'0.6.2' is no number of metres" in line for line in printed)
         os.write(keys, b"0.62\r")
         wait(lambda: bool(gateway.of(Finished)), 20, made.log)
         assert gateway.of(Finished)[0].distance == 0.62

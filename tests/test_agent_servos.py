@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from agents import CONFIG, DARWIN, Lab, changed, wait
+from agents import CONFIG, DARWIN, Lab, changed, lab, wait
 from test_agent_mounting import FACTORY, HEAD, IDS, robot_with
 
 from hardware_agent.body import Body
@@ -142,6 +142,39 @@ def test_an_acceleration_that_another_program_left_is_taken_back(
         told = [line for line in body.open() if "acceleration" in line]
         assert told == [f"servo {IDS[HEAD]}: goal acceleration 10 made 0"]
         assert robot.servos[HEAD].memory.get(ACCELERATION[protocol]) == 0
+
+
+@pytest.mark.parametrize(
+    ("protocol", "register", "value"),
+    [(1, "cw_angle_limit", 2300), (2, "min_position", 2300), (2, "homing_offset", -2200)],
+)
+def test_a_joint_beyond_what_its_servo_takes_is_not_enabled(
+    tmp_path: Path, protocol: int, register: str, value: int
+) -> None:
+    """The servo could not be told to stay there: it would snap to the end of what it takes."""
+    with robot_and_body(tmp_path, protocol) as (robot, body):
+        robot.servos[HEAD].memory.put(register, value)
+        body.open()
+        refused = str(body.enable(sensed(body)))
+        assert refused.startswith("enable: head_tilt is at ") and "turn it back by hand" in refused
+        assert not any(s.memory.get("torque_enable") for s in robot.servos)
+        robot.servos[HEAD].memory.put(register, 0)
+        body.open()
+        assert body.enable(sensed(body)) is None
+
+
+def test_a_robot_that_is_switched_on_later_is_told_of_as_at_the_start(tmp_path: Path) -> None:
+    """What is missing, then what was put right in the servos; and no trouble that is over."""
+    with lab(tmp_path, speed=0.0) as made:
+        made.side(cmd="fault", kind="dead_servo", id=11)
+        made.start_silent()
+        wait((tmp_path / "agent.sock").exists, 20, made.log)
+        wait(lambda: "no answer from servo 11" in str(made.health()["problems"]), 20, made.log)
+        made.side(cmd="fault", kind="dead_servo", id=11, off=True)
+        wait(made.ready, 20, made.log)
+        told = made.health()
+        assert (told["state"], told["reason"], told["problems"]) == ("disabled", "", [])
+        assert "servo 11: return delay 250 made 0" in made.log()
 
 
 def test_old_firmware_has_no_acceleration(tmp_path: Path) -> None:

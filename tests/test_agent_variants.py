@@ -164,6 +164,7 @@ case "$PUP_TRIAL" in
   good) echo "looking for the markers"; echo 0.73;;
   fails) echo "no marker is seen" >&2; exit 3;;
   nan) echo nan;;
+  millimetres) echo 730;;
   mute) ;;
   hangs) exec sleep 60;;
 esac
@@ -171,6 +172,7 @@ esac
 SAID = {
     "fails": "the distance hook ended with 3: no marker is seen",
     "nan": "the distance hook printed 'nan', not a number of metres",
+    "millimetres": "730 m in a walk of 0.2 s cannot be (1 m at most); tell it in metres",
     "mute": "the distance hook printed 'nothing', not a number of metres",
     "hangs": "timed out after 1",
 }

@@ -23,6 +23,7 @@ from hardware_agent.virtual.packets import Framer, checksum, crc
 from hardware_agent.virtual.robot import VirtualRobot
 from hardware_agent.virtual.server import Ports, Server
 from hardware_agent.virtual.servo import OVERHEATING
+from pup.errors import InputError
 
 PING_1 = b"\xff\xff\x05\x02\x01\xf7"
 BODY_2 = b"\xff\xff\xfd\x00\x05\x03\x00\x01"
@@ -284,3 +285,11 @@ def test_it_lives_until_it_is_stopped(tmp_path: Path, how: signal.Signals) -> No
     assert process.returncode == 0, err
     assert '"robot": "darwin_op2"' in out
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ports_share_no_path(tmp_path: Path) -> None:
+    """The link to the IMU would take the place of that to the bus, and nobody would be told."""
+    ports = Ports(tmp_path / "one", tmp_path / "one", tmp_path / "side")
+    with pytest.raises(InputError, match="give each a path of its own"):
+        Server(VirtualRobot(DARWIN, 1), ports)
+    assert not list(tmp_path.iterdir())

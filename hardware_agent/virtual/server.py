@@ -63,6 +63,8 @@ class Server(AbstractContextManager["Server"]):
     def __init__(
         self, robot: VirtualRobot, ports: Ports, speed: float = 1.0, period: float = 0.03
     ) -> None:
+        if len({path.absolute() for path in (ports.link, ports.imu, ports.side)}) < 3:
+            raise InputError("--link, --imu and --side: give each a path of its own")
         self.robot, self.speed, self.period = robot, speed, period
         self.faults = Faults(robot, robot.plant.characters[0].seed)
         self._framer = Framer()
