@@ -30,15 +30,20 @@ def write_atomic(path: Path, data: bytes | str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     raw = data.encode() if isinstance(data, str) else data
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    with open(part, "xb") as file:  # unlike one of `tempfile` with the rights of any new file
-        try:
-            file.write(raw)
-            file.flush()
-            os.fsync(file.fileno())
-            os.replace(part, path)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
+    try:
+        with open(part, "xb") as file:  # unlike one of `tempfile` with the rights of any new file
+            try:
+                file.write(raw)
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(part, path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
+    except OSError as error:
+        if error.errno is not None and not error.filename:
+            error.filename = str(path)  # a full disk does not say where
+        raise
 
 
 def write_json(path: Path, value: Any) -> None:

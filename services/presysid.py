@@ -103,7 +103,9 @@ class _Job:
             raise InputError(f"{start}: lies in the folder that is written to; copy it elsewhere")
         kind, space = read_fitted(start, self.robot)
         if kind not in self.actuators:
-            raise InputError(f"{start}: of the {kind} torque law, which is not fitted")
+            raise InputError(
+                f"{start}: of the {kind} torque law, which is not fitted; use --actuator {kind}"
+            )
         ends = zip(space.names, space.nominal, space.lower, space.upper, strict=True)
         for name, value, low, high in ends:
             if not low <= value <= high:

@@ -142,16 +142,17 @@ def read_walked(file: Path, policy: NumpyPolicy, digest: str) -> Walked:
         rows = [(tuple(map(float, t["eta"])), (t["distance"], t["time"])) for t in ended]
         values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 2)
         recordings = tuple(name for t in ended if (name := t.get("recording")))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{file}: not a study.json of `pup transfer`") from error
     if whose != digest:
         raise InputError(f"{file}: a study of another policy; give the one that walked")
     if not rows:
         raise InputError(f"{file}: no walk has ended by itself yet; let the study go on first")
     sizes = {len(eta) for eta, _ in rows}
-    if sizes != {policy.card.shape.eta} or not np.isfinite(values).all() or not 0 < horizon < 1e4:
-        raise InputError(f"{file}: its trials are none of this policy's")
     etas = list(dict.fromkeys(eta for eta, _ in rows))
+    finite = np.isfinite(values).all() and all(math.isfinite(x) for eta in etas for x in eta)
+    if sizes != {policy.card.shape.eta} or not finite or not 0 < horizon < 1e4:
+        raise InputError(f"{file}: its trials are none of this policy's")
     member = np.array([[eta == of for eta, _ in rows] for of in etas])
     count = member.sum(axis=1)
     distance, time = (member @ values / count[:, None]).T

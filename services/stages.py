@@ -69,9 +69,9 @@ class Journal:
     def __init__(self, out: Path) -> None:
         self.out, self.file = out, out / JOURNAL
         told = read_json(self.file) if self.file.exists() else {"schema": 1, "stages": {}}
-        if not isinstance(told, dict) or not isinstance(told.get("stages"), dict):
+        self._told = {"begun": {}} | told if isinstance(told, dict) else {}
+        if not all(isinstance(self._told.get(part), dict) for part in ("stages", "begun")):
             raise InputError(f"{self.file}: not the journal of a job; use another --out")
-        self._told = {"begun": {}} | told
         self._writing = threading.Lock()
 
     def once(self, stage: Stage) -> None:
@@ -109,8 +109,12 @@ class Journal:
         return same and self._left(stage, stage.files) == self._files(stage.files)
 
     def _entry(self, stage: Stage) -> dict[str, Any]:
+        """What is told of a step; nothing where that was changed to something else."""
         entry = self._told["stages"].get(stage.name)
-        return entry if isinstance(entry, dict) else {}
+        if not isinstance(entry, dict) or not isinstance(entry.get("seconds"), int | float):
+            return {}
+        tables = (entry.get(name) for name in ("inputs", "files"))
+        return entry if all(isinstance(table, dict) for table in tables) else {}
 
     def _left(self, stage: Stage, names: Sequence[str]) -> dict[str, str]:
         """SHA-256 of those of these files that the step left."""

@@ -291,6 +291,8 @@ class _Job:
         folder = self.options.start
         if folder is None:
             return None
+        if folder.resolve() in {(self.out / name).resolve() for name in ("policy", "best")}:
+            raise InputError(f"{folder}: would be written over; use another --out, or a copy of it")
         card, weights = read_bundle(folder, self.robot)
         seen = {name: getattr(self.shape, name) for name in ("parameters", "privileged")}
         if card.method != self.card.method or replace(card.shape, **seen) != self.shape:

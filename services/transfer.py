@@ -3,20 +3,22 @@
 import os
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 
 from pup.errors import InputError
 from pup.files import read_json, sha256, write_json
-from pup.policy.bundle import CARD, NumpyPolicy
+from pup.policy.bundle import CARD, NumpyPolicy, PolicyCard
 from pup.transfer.study import Gate
 from services.gateway.keys import check_name
 
 SCHEMA = 1
+FILE = "study.json"
 PERIOD = 1.0
 """Between two looks at the study, s."""
 TIMEOUT = 30.0
@@ -169,7 +171,8 @@ def transfer(
       The document of `study.json`.
 
     Raises:
-      InputError: the policy, the gateway or a setting cannot be used.
+      InputError: the policy, the gateway or a setting cannot be used, or the folder has another
+        study's file.
     """
     check_name(wanted.study)
     policy = NumpyPolicy.load(wanted.policy)
@@ -180,6 +183,8 @@ def transfer(
             "no eta to search; give one of `pup train --method pup` or `up`"
         )
     digest = sha256(wanted.policy / CARD)
+    _check_same(out / FILE, wanted.study, digest)
+    _check_rivals(card, wanted.settings.get("compare", ()))
     gateway = Gateway(wanted.url, wanted.token, told)
     asked = {
         "name": wanted.study,
@@ -200,10 +205,28 @@ def transfer(
             told(line)
             last = line
             document = _document(gateway, study)
-            write_json(out / "study.json", document)
+            write_json(out / FILE, document)
         if study["state"] == "done":
             return document
         time.sleep(PERIOD)
+
+
+def _check_same(file: Path, study: str, policy: str) -> None:
+    """Refuse to write over another study: its walks may be told nowhere else."""
+    if not file.exists():
+        return
+    told = read_json(file)
+    if not isinstance(told, dict) or (told.get("study"), told.get("policy")) != (study, policy):
+        raise InputError(f"{file}: is of another study, or of another policy; use another --out")
+
+
+def _check_rivals(card: PolicyCard, compare: Sequence[Sequence[float]]) -> None:
+    """Refuse etas to compare that no agent walks, before the search and not after it."""
+    for eta in compare:
+        try:
+            card.check_eta(eta)
+        except InputError as error:
+            raise InputError(f"--compare: {error}") from error
 
 
 def read_simulated(file: Path) -> dict[str, Any]:
@@ -217,6 +240,12 @@ def read_simulated(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: not simulated rollouts of schema {SCHEMA}")
     if not isinstance(told.get("eta"), list) or not isinstance(told.get("distance"), list):
         raise InputError(f"{file}: needs the lists eta and distance")
+    try:
+        tables = [np.array(told[name], dtype=np.float64) for name in ("eta", "distance")]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{file}: eta and distance must be tables of numbers") from error
+    if any(table.ndim != 2 or not np.isfinite(table).all() for table in tables):
+        raise InputError(f"{file}: eta and distance must be tables of finite numbers")
     return {"eta": told["eta"], "distance": told["distance"]}
 
 

@@ -150,10 +150,10 @@ def write_landscape(
 
 
 def _eta(policy: NumpyPolicy, told: tuple[float, ...]) -> Array:
-    if len(told) != policy.card.shape.eta:
-        raise InputError(
-            f"--eta: {len(told)} numbers, but the policy is conditioned on {policy.card.shape.eta}"
-        )
+    try:
+        policy.card.check_eta(told)
+    except InputError as error:
+        raise InputError(f"--eta: {error}") from error
     return np.array(told)
 
 

@@ -271,7 +271,8 @@ def bounds(**changes: Any) -> dict[str, Any]:
 
 
 def parameter(name: str, value: Any) -> list[dict[str, Any]]:
-    return [*bounds()["parameters"], {"name": name, "nominal": value}]
+    others = [known for known in bounds()["parameters"] if known["name"] != name]
+    return [*others, {"name": name, "nominal": value}]
 
 
 BOUNDS: dict[str, tuple[str, tuple[str, ...]]] = {

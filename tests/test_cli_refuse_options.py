@@ -191,6 +191,16 @@ for _name in OPTIONS:
         return place.presysid(*options), words
 
 
+@case("a start of a torque law that is not fitted")
+def _(place: Place) -> Made:
+    actuator = {"kind": "nn_pd", "weights": [0.0] * 27}
+    told = {"schema": 1, "robot": "darwin_leg", "actuator": actuator, "parameters": []}
+    start = place.write("bounds.json", json.dumps(told))
+    law = ("--actuator", "pd", "--no-comparison", "--start", start)
+    given = ["presysid", place.leg, "--robot", "darwin_leg", "--out", place.out, "--local", *law]
+    return given, (start, "nn_pd", "--actuator nn_pd")
+
+
 @case("an address where no cluster is")
 def _(place: Place) -> Made:
     command = [a for a in place.presysid("--address", "127.0.0.1:1") if a != "--local"]

@@ -82,6 +82,13 @@ def _(place: Place) -> Made:
     return train(place, "--start", folder), (folder / "policy.json", "cannot be read")
 
 
+@case("a start that would be written over")
+def _(place: Place) -> Made:
+    folder = place.here / "policy"
+    policy, command = agents.bundle(folder), train(place, "--start", folder)
+    return [*command[:-1], policy.parent], (policy, "written over", "--out")
+
+
 @case("a tracker that is not installed")
 def _(place: Place) -> Made:
     return train(place, "--track", "mlflow"), ("--track mlflow", "not installed")
@@ -117,14 +124,26 @@ def _(place: Place) -> Made:
     return walk(place, "--policy", place.here, "--eta", "a,b"), ("--eta", "'a,b'", "numbers")
 
 
-@case("a landscape over an eta that the policy has not")
-def _(place: Place) -> Made:
-    """Before it walks."""
+def walker(place: Place, method: Method) -> Path:
+    """A policy that was trained on the robot's own bounds."""
     bounds = read_bounds(IDENTIFIED, DARWIN)
-    folder = agents.bundle(place.here / "policy", parameters=bounds.names, method=Method.ROBUST)
+    folder = agents.bundle(place.here / "policy", parameters=bounds.names, method=method)
     card, weights = read_bundle(folder)
     told = {"parameter_lower": bounds.lower.tolist(), "parameter_upper": bounds.upper.tolist()}
     write_bundle(folder, replace(card, **told), weights)
+    return folder
+
+
+@case("an eta that nothing projects to")
+def _(place: Place) -> Made:
+    folder = walker(place, Method.PUP)
+    return walk(place, "--policy", folder, "--eta", "0,0,5"), ("--eta: 0,0,5", "outside -1 to 1")
+
+
+@case("a landscape over an eta that the policy has not")
+def _(place: Place) -> Made:
+    """Before it walks."""
+    folder = walker(place, Method.ROBUST)
     return walk(place, "--policy", folder, "--landscape", 4), (folder, "leave --landscape out")
 
 

@@ -85,6 +85,19 @@ def _(place: Place) -> Made:
     return transfer(place, "--policy", "x", "--compare", "a,b"), ("--compare", "'a,b'")
 
 
+@case("an eta to compare that nothing projects to")
+def _(place: Place) -> Made:
+    """Before the search: no agent would walk it after that, and the study would never end."""
+    wild = transfer(place, "--policy", bundle(place), "--compare", "0.1,9,0")
+    return wild, ("--compare: 0.1,9,0", "outside -1 to 1")
+
+
+@case("an eta to compare of another length")
+def _(place: Place) -> Made:
+    wrong = transfer(place, "--policy", bundle(place), "--compare", "0.1,0.2")
+    return wrong, ("--compare: 2 numbers", "on 3")
+
+
 @case("more trials than there can be")
 def _(place: Place) -> Made:
     return transfer(place, "--policy", "x", "--trials", 5000), ("--trials", "1000")
@@ -94,6 +107,29 @@ def _(place: Place) -> Made:
 def _(place: Place) -> Made:
     file = place.write("simulated.json", json.dumps({"schema": 2}))
     return transfer(place, "--policy", bundle(place), "--simulated", file), (file, "schema 1")
+
+
+for what, eta in {
+    "no numbers": [[0.0, None, 0.0]],
+    "no finite numbers": [[0.0, float("nan"), 0.0]],
+    "no table": [[0.0, 0.1, 0.2], [0.0]],
+    "no rows": [0.0, 0.1, 0.2],
+}.items():
+
+    @case(f"simulated rollouts with {what}")
+    def _(place: Place, eta: list[object] = eta) -> Made:
+        told = {"schema": 1, "eta": eta, "distance": [[0.5]]}
+        file = place.write("simulated.json", json.dumps(told))
+        given = transfer(place, "--policy", bundle(place), "--simulated", file)
+        return given, (file, "eta and distance", "numbers")
+
+
+@case("a folder with another study")
+def _(place: Place) -> Made:
+    """Its walks may be told nowhere else."""
+    file = place.write("study.json", json.dumps({"schema": 1, "study": "monday", "policy": "0"}))
+    given = transfer(place, "--policy", bundle(place))[:-1]
+    return [*given, file.parent], (file, "another study", "--out")
 
 
 @case("a configuration that is not there")

@@ -5,13 +5,16 @@ import signal
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import grpc
 import pytest
 import ray
 from commandline import TINY, pup_process
 
 from pup.errors import InputError
+from workers import cluster
 from workers.cluster import connected, staying
 
 
@@ -62,9 +65,23 @@ def test_a_cluster_without_a_token_for_it_is_told_in_a_line(
     monkeypatch.setenv("HOME", str(tmp_path))  # where Ray would look for one
     for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.delenv(name, raising=False)
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        address = f"127.0.0.1:{listening.getsockname()[1]}"
-        given = ("presysid", bench_recordings, "--robot", "servo_bench", "--out", tmp_path / "out")
-        done = pup_process(*given, *TINY[1:], "--address", address)
+    greeting = grpc.server(ThreadPoolExecutor(1))  # as any of Ray's does
+    address = f"127.0.0.1:{greeting.add_insecure_port('127.0.0.1:0')}"
+    greeting.start()
+    given = ("presysid", bench_recordings, "--robot", "servo_bench", "--out", tmp_path / "out")
+    done = pup_process(*given, *TINY[1:], "--address", address)
+    greeting.stop(None)
     assert done.code == 2
     assert f"{address}: no token" in done.err and len(done.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_what_listens_and_is_no_cluster_is_told_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    """Ray would wait for it for over ten minutes, and hear no Ctrl-C meanwhile."""
+    monkeypatch.setattr(cluster, "GREETING_SECONDS", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        address = f"{scheme}127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(InputError, match="no Ray cluster answers there"), connected(address):
+            pass

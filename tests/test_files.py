@@ -1,11 +1,15 @@
 """Files written whole, with the rights of any new file; what is wrong with one that is read."""
 
 import os
+import resource
 import socket
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commandline import pup
 
@@ -51,6 +55,21 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
 
 
+def test_a_full_disk_is_told_with_its_place(tmp_path: Path) -> None:
+    """And what was there stays; a limit on the size of files stands in for the disk."""
+    file = tmp_path / "bounds.json"
+    file.write_bytes(b"before")
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, usual[1]))
+    try:
+        with pytest.raises(OSError, match="too large") as told:
+            write_atomic(file, bytes(2000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    assert told.value.filename == str(file)
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("bounds.json", b"before")]
+
+
 def test_trouble_of_the_storage_is_no_bad_input(no_file: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_json(no_file.with_name("absent"))
@@ -68,6 +87,24 @@ def test_nor_is_it_of_a_robot(no_file: Path) -> None:
 def test_a_checkpoint_that_cannot_be_read_now_is_kept(no_file: Path) -> None:
     with pytest.raises(OSError, match="No such device"):
         Checkpoint(no_file, "of something")
+
+
+def flipped(content: bytes) -> Iterator[bytes]:
+    """Every byte of it in turn as another, and every beginning of it."""
+    for at in range(len(content)):
+        yield content[:at]
+        yield content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+
+
+def test_any_cut_or_flipped_byte_of_a_checkpoint_is_refused_or_harmless(tmp_path: Path) -> None:
+    """Never a traceback, never another training."""
+    file, rows = tmp_path / "checkpoint.npz", [{"steps": 80}]
+    Checkpoint(file, "of this").write({"learner/iteration": np.array(3)}, rows, 0, 1.0)
+    for content in flipped(file.read_bytes()):
+        file.write_bytes(content)
+        with suppress(InputError):
+            kept = Checkpoint(file, "of this")
+            assert kept.state["learner/iteration"] == 3 and kept.rows == rows
 
 
 def test_trouble_of_the_storage_ends_a_verb_with_another_code(

@@ -1,5 +1,6 @@
 """What a policy from scratch begins with: patterns, their search and their imitation."""
 
+import io
 import json
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -267,7 +268,16 @@ def test_a_robot_without_a_mirror_map_is_trained(tmp_path: Path) -> None:
     assert document["done"] and (tmp_path / "out" / "policy" / "weights.npz").exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY no"])
+def packed_strangely() -> bytes:
+    """A search whose first array is packed in a way that nobody knows."""
+    content = io.BytesIO()
+    np.savez(content, losses=np.zeros((1, 20)))
+    raw = bytearray(content.getvalue())
+    raw[raw.index(b"PK\x01\x02") + 10] = 99
+    return bytes(raw)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY no", packed_strangely()])
 def test_a_broken_search_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "pattern.npz").write_bytes(content)
     with pytest.raises(InputError, match=r"pattern\.npz: not a search for a gait"):

@@ -45,6 +45,10 @@ def test_bounds_are_read_around_the_fitted_values() -> None:
         ({"lower": 2.0, "upper": 1.0}, "parameter 'rho/arm': [2, 1] are no bounds"),
         ({"lower": 1.0, "upper": float("inf")}, "parameter 'rho/arm': [1, inf] are no bounds"),
         ({"name": "rho/tail"}, "parameter 'rho/tail' is not one of robot 'darwin_op2'"),
+        ({"name": "rho/head"}, "parameter 'rho/head' stands there more than once"),
+        ({"lower": -5.0, "upper": -4.0}, "'rho/arm': bounds [-5, -4] outside its search range 0"),
+        ({"lower": 50.0, "upper": 60.0}, "'rho/arm': bounds [50, 60] outside its search range 0"),
+        ({"nominal": -1.0}, "parameter 'rho/arm': nominal -1 outside its search range 0 to 3"),
     ],
 )
 def test_wrong_bounds_are_refused(tmp_path: Path, entry: dict[str, Any], words: str) -> None:

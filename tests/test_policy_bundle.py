@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pup.errors import InputError
-from pup.policy.bundle import NumpyPolicy, PolicyCard, read_bundle, write_bundle
+from pup.files import write_json
+from pup.policy.bundle import NumpyPolicy, PolicyCard, _digest, read_bundle, write_bundle
 from pup.policy.rebase import for_bounds
 from pup.policy.shape import Method
 from pup.robot import RobotDescription, TermSpec
@@ -193,6 +194,19 @@ def test_changed_bundles_are_refused(bundle: Path) -> None:
     refused(bundle, "policy.json", "not a policy")
     (bundle / "policy.json").unlink()
     refused(bundle, "policy.json", "cannot be read")
+
+
+@pytest.mark.parametrize("part", ["rates", "sha256", "policy.onnx"])
+@pytest.mark.parametrize("more", [{}, {"clock": 1}, {"method": "sac"}])
+def test_a_bundle_of_another_pup_is_refused(
+    bundle: Path, part: str, more: dict[str, object]
+) -> None:
+    """Its card is whole, but tells less, more or something else."""
+    card = json.loads((bundle / "policy.json").read_text())
+    del card["digest"]
+    del (card if part in card else card["sha256"])[part]
+    write_json(bundle / "policy.json", card | more | {"digest": _digest(card | more)})
+    refused(bundle, "policy.json", "another version")
 
 
 def test_a_bundle_of_another_robot_is_refused(bundle: Path) -> None:

@@ -115,6 +115,8 @@ def test_walks_are_made_again_at_the_rate_of_the_robot(tmp_path: Path) -> None:
         ([trial(ETAS[0], None, state="lost")], {}, "no walk"),
         ([trial([0.0, 0.0], 1.0)], {}, "none of this policy"),
         ([trial(ETAS[0], float("nan"))], {}, "none of this policy"),
+        ([trial([0.0, 0.0, float("nan")], 1.0)], {}, "none of this policy"),
+        ([trial(ETAS[0], 10**400)], {}, "not a study.json"),
     ],
 )
 def test_studies_that_cannot_be_walked_again(

@@ -134,6 +134,24 @@ def test_who_is_stopped_while_a_folder_is_emptied_empties_it_again(
     assert counter.count == 2 and kept(tmp_path) == []
 
 
+@pytest.mark.parametrize(
+    "change", [{"files": []}, {"files": None}, {"seconds": None}, {"inputs": "a"}]
+)
+def test_a_stage_whose_entry_was_changed_is_done_again(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    """From what it left: nothing is lost."""
+    counter = Counter(tmp_path)
+    Journal(tmp_path).once(counter.stage())
+    told = json.loads((tmp_path / "run.json").read_text())
+    told["stages"]["one"] |= change
+    write_json(tmp_path / "run.json", told)
+    journal = Journal(tmp_path)
+    journal.once(counter.stage())
+    assert counter.count == 2 and "attempt1" in kept(tmp_path)
+    assert journal.done("one").files
+
+
 def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text('{"stages": []}')
     with pytest.raises(InputError, match="not the journal"):

@@ -202,6 +202,18 @@ def test_the_best_is_walked_again_before_it_is_kept():
     assert "improvement" in early.why
 
 
+def test_a_best_that_gives_no_results_any_more_is_not_asked_for_for_ever():
+    """Once may be an accident; after another one the walks that are left go elsewhere."""
+    rng = np.random.default_rng(0)
+    eta = rng.uniform(-1, 1, (23, 3))
+    asked = replace(search(eta, landscapes.Robot.draw(0).walk(eta, rng)), trials=25)
+    best = suggest(asked, 24).eta
+    once = suggest(replace(asked, fruitless=(best,), avoided=(best,)), 25)
+    assert once.eta == best and "once more" in once.why
+    twice = suggest(replace(asked, fruitless=(best, best), avoided=(best, best)), 26)
+    assert np.linalg.norm(np.subtract(twice.eta, best)) > 0.1 and "gave no result" in twice.why
+
+
 def test_simulated_landscapes_lead_to_a_good_eta_in_few_walks():
     simulated = simulate()
     with_prior, without = [], []
@@ -268,6 +280,11 @@ def test_an_infeasible_eta_is_never_chosen():
         assert feasible[chosen]
     with pytest.raises(InputError, match="no eta was feasible"):
         choose(replace(made, feasible=np.zeros(8, bool)))
+
+
+def test_one_walk_does_not_tell_how_far_the_next_one_comes():
+    told = choose(search([(0.0, 0.0, 0.0)], [0.8]))
+    assert told.mean == pytest.approx(0.8) and told.deviation > 0.05
 
 
 def test_nothing_can_be_chosen_of_nothing():

@@ -18,10 +18,12 @@ from types import FrameType
 from typing import Any
 from urllib.parse import urlsplit
 
+import grpc  # type: ignore[import-untyped]
 import ray
 from ray._private import ray_constants
 from ray._private import utils as ray_utils
 from ray._private import worker as ray_worker
+from ray._private.grpc_utils import init_grpc_channel
 from ray.exceptions import AuthenticationError
 
 from pup.errors import InputError
@@ -29,6 +31,8 @@ from workers import reaper
 
 OBJECT_STORE = 256 * 2**20  # bytes; the recordings are the largest object
 PROBE_SECONDS = 5.0
+GREETING_SECONDS = 20.0
+"""In which a busy cluster greets who connects."""
 RAY_SETTINGS = {
     "RAY_worker_cap_enabled": "0",  # see the module
     # A node whose link is down answers nobody, and does not refuse either: what was asked of it
@@ -118,7 +122,10 @@ def _joined(address: str) -> Iterator[None]:
 
 
 def _probe(address: str) -> None:
-    """Refuse an address where nothing listens: Ray would try again for over ten minutes."""
+    """Refuse an address where nothing listens, or what listens greets nobody as Ray does.
+
+    Ray would try again for over ten minutes, and hear no Ctrl-C meanwhile.
+    """
     if address == "auto":
         return
     try:
@@ -130,8 +137,11 @@ def _probe(address: str) -> None:
         raise InputError(f"--address {address}: expected host:port, ray://host:port or auto")
     try:
         socket.create_connection((host, port), PROBE_SECONDS).close()
-    except OSError as error:
-        told = error.strerror or error
+        with init_grpc_channel(place.netloc, [("grpc.enable_http_proxy", 0)]) as channel:
+            grpc.channel_ready_future(channel).result(GREETING_SECONDS)
+    except (OSError, grpc.FutureTimeoutError) as error:
+        silent = isinstance(error, grpc.FutureTimeoutError)
+        told = "what listens there is none, or hangs" if silent else error.strerror or error
         raise InputError(f"--address {address}: no Ray cluster answers there ({told})") from error
 
 

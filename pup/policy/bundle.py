@@ -7,7 +7,7 @@ holds arrays without pickle, `policy.onnx` the same computation from `obs` and `
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ CARD, WEIGHTS, GRAPH = "policy.json", "weights.npz", "policy.onnx"
 WEIGHTS_LIMIT = 64 * 2**20  # bytes
 CLIP, FLOOR = 5.0, 1e-6
 """As in `pup.policy.network`, whose import would be torch's."""
+EDGE = 1 + 1e-6
+"""Largest size of what a tanh gives, and what rounding makes of it."""
 NAMED = 3
 """Differences of a robot from the one of the training that a refusal names."""
 
@@ -99,6 +101,20 @@ class PolicyCard:
         if not low * 0.99 <= rate <= high * 1.01:
             raise InputError(f"the policy was trained for {low:g} to {high:g} Hz, not {rate:g}")
 
+    def check_eta(self, eta: Sequence[float]) -> None:
+        """Refuse an eta that nothing projects to: no agent walks it.
+
+        Raises:
+          InputError: it is one, or of another length.
+        """
+        if len(eta) != self.shape.eta:
+            raise InputError(
+                f"{len(eta)} numbers, but the policy is conditioned on {self.shape.eta}"
+            )
+        if self.shape.latent and not all(abs(x) <= EDGE for x in eta):
+            told = ",".join(f"{x:g}" for x in eta)
+            raise InputError(f"{told} is outside -1 to 1, where all projections lie")
+
     def document(self) -> dict[str, Any]:
         """The card as JSON values."""
         told = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -161,9 +177,15 @@ def read_bundle(folder: Path, robot: RobotDescription | None = None) -> tuple[Po
     digest = told.pop("digest", None)
     if digest != _digest(told):
         raise InputError(f"{file}: was changed after it was written; take the bundle anew")
-    contents = {name: _content(folder / name, told["sha256"][name]) for name in (WEIGHTS, GRAPH)}
-    del told["sha256"]
-    card = PolicyCard.read(told)
+    try:
+        digests = told.pop("sha256")
+        known = {name: str(digests[name]) for name in (WEIGHTS, GRAPH)}
+        card = PolicyCard.read(told)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:  # its digest is right
+        raise InputError(
+            f"{file}: written by a pup of another version; use that one, or train the policy anew"
+        ) from error
+    contents = {name: _content(folder / name, digest) for name, digest in known.items()}
     if robot is not None and (robot.name, robot.joint_names) != (card.robot, card.joints):
         raise InputError(
             f"{file}: the policy is of robot {card.robot!r} with {len(card.joints)} joints, not of "

@@ -197,6 +197,7 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
             raise InputError(f"{path}: bounds of robot {document['robot']!r}, not {robot.name!r}")
         kind = document["actuator"]["kind"]
         values = {p["name"]: float(p["nominal"]) for p in document["parameters"]}
+        names = [p["name"] for p in document["parameters"]]
         weights = [float(weight) for weight in document["actuator"]["weights"]]
         imu = {p["name"]: float(p["nominal"]) for p in document.get("imu", [])}
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -211,6 +212,8 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
     unknown = [name for name in values if name not in space.names]
     if unknown:
         raise InputError(f"{path}: parameter {unknown[0]!r} is not one of robot {robot.name!r}")
+    if twice := [name for name in values if names.count(name) > 1]:
+        raise InputError(f"{path}: parameter {twice[0]!r} stands there more than once")
     if kind == "nn_pd" and len(weights) != len(NETWORK_NAMES):
         raise InputError(f"{path}: {len(weights)} network weights, {len(NETWORK_NAMES)} expected")
     values |= dict(zip(NETWORK_NAMES, weights, strict=False))
@@ -259,7 +262,8 @@ def read_bounds(path: Path, robot: RobotDescription) -> FittedBounds:
     """Read a `bounds.json` or `identified.json` as a box around a fitted point.
 
     Raises:
-      InputError: as `read_fitted`, and bounds that are absent, not finite or the wrong way round.
+      InputError: as `read_fitted`; bounds that are absent, not finite or the wrong way round; and
+        bounds or a fitted value outside the search range, where there is nothing to simulate.
     """
     actuator, space = read_fitted(path, robot)
     names, lower, upper = [], [], []
@@ -271,9 +275,35 @@ def read_bounds(path: Path, robot: RobotDescription) -> FittedBounds:
             raise InputError(f"{path}: parameter {name!r} has no bounds lower and upper") from error
         if not -np.inf < low <= high < np.inf:
             raise InputError(f"{path}: parameter {name!r}: [{low:g}, {high:g}] are no bounds")
+        _check_range(path, space.select((name,)), low, high)
         names.append(name)
         lower.append(low)
         upper.append(high)
     if not names:
         raise InputError(f"{path}: no bounded parameter in it")
     return FittedBounds(actuator, space, tuple(names), np.array(lower), np.array(upper))
+
+
+def _check_range(path: Path, space: ParameterSpace, low: float, high: float) -> None:
+    """Refuse bounds that do not reach into the search range of their parameter, or a value beyond.
+
+    Args:
+      path: of the bounds.
+      space: the parameter, with the fitted value as the nominal one.
+      low: lower bound.
+      high: upper bound.
+    """
+    ((name, least, most, value),) = zip(
+        space.names, space.lower, space.upper, space.nominal, strict=True
+    )
+    rounding = 1e-9 * (most - least)  # of what was put back from the unit cube
+    if not (low <= most + rounding and high >= least - rounding):
+        what = f"bounds [{low:g}, {high:g}]"
+    elif not least - rounding <= value <= most + rounding:
+        what = f"nominal {value:g}"
+    else:
+        return
+    raise InputError(
+        f"{path}: parameter {name!r}: {what} outside its search range {least:g} to {most:g} in the "
+        "robot's description; give bounds that were found with this description"
+    )

@@ -40,7 +40,8 @@ fall one walks far once and falls the next time, which one walk of each does not
 FEWEST = 4
 """Walks before which no search is over: distances that are alike may be so by chance."""
 OFFERED = 2
-"""Trials without a result after which an initial point is left out: one may be an accident."""
+"""Trials without a result after which an initial point, or the best, is left out: one may be an
+accident."""
 SAMPLES = 64
 """Draws of the process that expected improvement is averaged over."""
 
@@ -122,6 +123,10 @@ class Search:
             raise InputError("no eta was feasible, so nothing can be chosen")
         return np.asarray(tried[np.argmax(surrogate.predict(tried)[0])])
 
+    def walkable(self, unit: Array) -> bool:
+        """Whether an eta of the unit cube gives results by now, or has not failed often enough."""
+        return int(_same(unit[None], self.unit(self.avoided)).sum()) < OFFERED
+
     def real(self, unit: Array) -> Array:
         """Etas of the box from those of the unit cube."""
         low, high = np.array(self.lower), np.array(self.upper)
@@ -197,8 +202,7 @@ def suggest(search: Search, number: int) -> Decision:
         )
     surrogate = surrogate_of(search.told, search.prior)
     rng = np.random.default_rng((search.seed, number))
-    if search.confirming:
-        unit = search.best(surrogate)
+    if search.confirming and search.walkable(unit := search.best(surrogate)):
         why = "the best so far, once more before one is kept"
         return _decision(search, surrogate, unit, Purpose.SEARCH, why, began)
     if len(search.distance) or search.avoided:

@@ -223,7 +223,7 @@ class Surrogate:
     def __init__(self, told: Told, prior: Landscapes | None = None) -> None:
         self.simulated = prior is not None
         if prior is None:
-            self.centre, spread = float(told.distance.mean()), float(told.distance.std())
+            self.centre, spread = float(told.distance.mean()), _spread(told.distance)
         else:
             self.centre, spread = prior.centre, prior.spread
         self.scale = max(spread, SPREAD_FLOOR)
@@ -258,6 +258,11 @@ class Surrogate:
             "signal": self.scale * float(matern.outputscale.detach().sqrt()),
             "noise": self.scale * float(self.model.likelihood.noise.detach().sqrt()),
         }
+
+
+def _spread(distance: Array) -> float:
+    """Deviation of distances, m; of a single one, of which nothing is known, its own size."""
+    return float(distance.std() if len(distance) > 1 else np.abs(distance).max())
 
 
 def surrogate_of(told: Told, prior: Landscapes | None) -> Surrogate:
