@@ -19,9 +19,11 @@ WEIGHT = "phi/"
 
 
 def check_folder(robot: RobotDescription, folder: Path) -> None:
-    """Refuse to write a robot over the one that it comes from."""
+    """Refuse to write a robot over the one that it comes from, or where a file is."""
     if folder.resolve() == robot.folder.resolve():
         raise InputError(f"{folder}: is the folder of {robot.name!r} itself; name another")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: a file is in the place of this folder; move it away")
 
 
 def write_corrected(

@@ -145,6 +145,15 @@ def test_a_corrected_robot_is_not_diagnosed_into_its_own_folder(tmp_path: Path) 
         run_diagnosis(robot, recordings({}, 1), tmp_path, nowhere, lambda stage, share: None)
 
 
+def test_a_file_in_place_of_the_corrected_robot_is_told_first(tmp_path: Path) -> None:
+    """This, too, and not after hours of fits."""
+    (tmp_path / "corrected").write_text("mine")
+    nowhere = Where(lambda measured, actuator: pytest.fail("simulated"), 1, here=True)
+    with pytest.raises(InputError, match=r"corrected: a file is in the place of this folder"):
+        run_diagnosis(BENCH, recordings({}, 1), tmp_path, nowhere, lambda stage, share: None)
+    assert (tmp_path / "corrected").read_text() == "mine"
+
+
 def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path) -> None:
     """Two sets of recordings under the same parameters are two questions."""
     asked: list[int] = []

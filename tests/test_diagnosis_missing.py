@@ -130,6 +130,13 @@ def test_a_gap_is_closed_or_not() -> None:
         "The stiffness kp of the hip is 2 times as large early in a recording as late in it "
         "(90 % interval of the ratio 1.90 to 2.10); with what was found, the ratio is 1.67"
     )
+    hidden = split("hip", "fast", "slow", tau_max=1 / 460)
+    assert report_splits.sentence(report_splits.found_gaps((hidden,), ())[0]) == (
+        "The torque limit tau_max of the hip is 460 times as large in slow motion as in fast "
+        "(90 % interval of the ratio 438 to 483)."
+    )
+    apart = report_splits.found_gaps((split("hip", "fast", "slow", tau_max=1.954),), ())
+    assert "is 1.95 times as large" in report_splits.sentence(apart[0])
     small = report_splits.found_gaps((split("hip", "on the ground", "in the air", kd=1.2),), ())
     assert "is 20 % larger on the ground than in the air" in report_splits.sentence(small[0])
 
@@ -150,6 +157,13 @@ def test_halves_that_differ_are_drawn_before_and_after(backlash: Diagnosis, tmp_
     ) in shown.text
     assert "is 1.9 times as large on the ground as in the air" in shown.text
     assert len(shown.all("img")) == 1
+    assert "outside the picture" not in shown.text
+
+
+def test_a_ratio_that_leaves_the_picture_is_admitted(backlash: Diagnosis, tmp_path: Path) -> None:
+    before = (split("hip", "fast", "slow", tau_max=1 / 460),)
+    told = report_splits.gaps(replace(backlash, splits=(before, before)), speech(backlash))
+    assert "Dots beyond 8 to 1 are outside the picture." in section(told, tmp_path).text
 
 
 @pytest.mark.usefixtures("undrawn")

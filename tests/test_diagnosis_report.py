@@ -9,14 +9,17 @@ from typing import Any
 
 import pytest
 from diagnoses import Maker
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from test_report import Page
 
 from pup.diagnosis import summary
 from pup.diagnosis.document import document
-from pup.diagnosis.drawing import draw_robot
+from pup.diagnosis.drawing import MARKS, draw_robot, ink_on
+from pup.diagnosis.experiment import NextRecording, Pair
 from pup.diagnosis.nominal import Certificate
 from pup.diagnosis.report import write_report
+from pup.diagnosis.report_findings import badge
 from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.wording import Speech
 from pup.physics.terms import Place
@@ -92,6 +95,40 @@ def test_report_of_a_mismatch(backlash: Diagnosis, tmp_path: Path) -> None:
     parameters = {row[0]: row for row in shown.table("Parameter")}
     assert parameters["damping kd of the hip"][-1].startswith("0 %")
     assert len(shown.table("Recording")) == 4
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_a_recording_tells_apart_has_its_own_name(backlash: Diagnosis, tmp_path: Path) -> None:
+    """Where the document, by the contract, has none."""
+    pair = Pair("stribeck_friction", "rising_static_friction", 50.0)
+    ask = NextRecording("drop", "a drop", "bench", {}, False, "a drop would tell", (pair, pair))
+    told = replace(backlash, ask=ask)
+    assert ask.document()["splits"] == [["stribeck_friction", "unknown"]]
+    shown = page(told, tmp_path, {"next_recording": ask.document()})
+    wanted = (
+        "dry friction that is higher at rest from dry friction that grows with the time at rest"
+    )
+    assert shown.text.count(wanted) == 1
+
+
+@pytest.mark.parametrize("colour", MARKS)
+def test_numbers_of_findings_can_be_read(colour: str) -> None:
+    """Contrast of small text by WCAG 2.1, success criterion 1.4.3."""
+
+    def luminance(of: str) -> float:
+        parts = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in to_rgb(of)]
+        return 0.2126 * parts[0] + 0.7152 * parts[1] + 0.0722 * parts[2]
+
+    dark, light = sorted((luminance(colour), luminance(ink_on(colour))))
+    assert (light + 0.05) / (dark + 0.05) >= 4.5
+    number = MARKS.index(colour) + 1
+    assert f"color: {ink_on(colour)}; background: {colour}" in badge(number)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_no_effect_is_seen_at_any_size(backlash: Diagnosis, tmp_path: Path) -> None:
+    sizes = [row[3] for row in page(backlash, tmp_path).table("Effect")[1:]]
+    assert sizes and all(float(size.replace(",", "")) > 0 for size in sizes)
 
 
 @pytest.mark.usefixtures("undrawn")

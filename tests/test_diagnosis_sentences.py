@@ -12,7 +12,7 @@ from pup.diagnosis.document import document
 from pup.diagnosis.laws import WORDS
 from pup.diagnosis.sentences import sentence
 from pup.diagnosis.verdict import Parameter
-from pup.diagnosis.wording import percent, shift, spoken
+from pup.diagnosis.wording import effect_words, percent, shift, spoken
 from pup.physics.terms import TERMS, Place
 from pup.robot import RobotDescription
 
@@ -92,6 +92,46 @@ def test_a_sliding_joint_is_told_in_millimetres() -> None:
     words = told(emps, "backlash", Place("joint", "axis"), gap=0.0005)
     assert words == "The axis loses 1 mm at every load reversal: gear backlash."
     assert " N works" in told(emps, "coulomb_friction", Place("joint", "axis"), torque=20.0)
+
+
+SERVOS = sorted(name for name, term in TERMS.items() if {"joint", "robot"} <= set(term.kinds))
+
+
+@pytest.mark.parametrize("effect", SERVOS)
+def test_what_all_joints_do_is_not_said_of_the_robot(op2: Maker, effect: str) -> None:
+    """A robot neither turns nor sticks, and has no gear."""
+    everywhere = PLACES["robot"]
+    speak = speech(op2.missing(effect, everywhere))
+    named = [speak.heading(effect, everywhere), speak.words(effect, everywhere)]
+    named += [speak.lack(effect, [everywhere]), speak.short(effect, everywhere)]
+    assert all("robot" not in words and "all joints" in words.lower() for words in named)
+    assert "robot" not in told(op2, effect, everywhere).lower()
+
+
+def test_joints_are_several(op2: Maker) -> None:
+    share = {"share": 0.15}
+    assert told(op2, "load_dependent_friction", PLACES["group"], **share) == (
+        "The hip joints lose 30 % of the load that they carry to friction."
+    )
+    assert told(op2, "backlash", PLACES["robot"], gap=0.008) == (
+        "All joints lose 0.92° at every load reversal: gear backlash."
+    )
+    clocks = Place("robot")
+    assert speech(op2.missing("clock_skew", clocks)).words("clock_skew", clocks) == (
+        "two clocks that run apart on the robot"
+    )
+
+
+def test_a_cable_pulls_one_way(op2: Maker) -> None:
+    """Its constant pull has a direction of its own, which is not back."""
+    for preload, way in ((0.05, "positive"), (-0.05, "negative")):
+        words = told(op2, "joint_spring", PLACES["joint"], stiffness=0.15, preload=preload)
+        assert words.endswith(f"and 0.05 N m in the {way} direction all the time.")
+
+
+def test_names_of_people_have_capitals() -> None:
+    assert effect_words("coulomb_friction") == "Coulomb friction"
+    assert effect_words("stribeck_friction") == "Stribeck friction"
 
 
 @pytest.mark.parametrize("effect", TERMS)

@@ -85,6 +85,9 @@ def test_where_motions_tell_nothing_another_one_is_asked_for() -> None:
 def test_of_steps_those_that_move_the_joints_come_first() -> None:
     told = recorded_besides(measured_under(BENCH, {}, ("triangle",), 1.0))
     assert (told.motion, told.words) == ("step", "steps of 0.3 rad")
+    assert told.reason == (
+        "steps of 0.3 rad, beside what was recorded, would move the joints in another way"
+    )
 
 
 def test_where_recordings_are_spoilt_the_same_is_asked_for_again() -> None:

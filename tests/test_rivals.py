@@ -16,14 +16,19 @@ from diagnoses import Maker
 from diagnosis_cases import BENCH, recordings
 from test_report import Page
 
+from pup.diagnosis import rivals
+from pup.diagnosis.coordinates import nominal_coordinate
+from pup.diagnosis.fit import Fit
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.report_rivals import beside, takeaway
-from pup.diagnosis.residuals import LOST
-from pup.diagnosis.rivals import Errors, Rivals, _rms, compare
+from pup.diagnosis.residuals import LOST, Measured, Noise
+from pup.diagnosis.rivals import Errors, Rivals, _fitted, _rms, _start, compare
+from pup.diagnosis.store import Store
 from pup.diagnosis.wording import Speech
 from pup.physics.parameters import robot_space
-from pup.recording import write_recordings
-from pup.robot import RobotDescription
+from pup.recording import load_recordings, write_recordings
+from pup.robot import RobotDescription, TermSpec
+from pup.robot_writer import write_corrected
 from pup.sysid.accuracy import JointUnits
 from pup.sysid.figures import drawing_style
 from services.diagnosis import alone, run_diagnosis
@@ -63,6 +68,37 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
 def test_nn_pd_is_fitted(done: Done) -> None:
     fit = done.rivals["nn_pd_fit"]
     assert fit["rmse_after"] < 0.6 * fit["rmse_before"]
+
+
+def test_the_box_of_its_weights_does_not_end_nn_pds_fit_at_its_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A servo that sticks and rattles, and the nominal fit of a diagnosis of it."""
+    terms = (
+        TermSpec("stribeck_friction", "joint", "servo", {"torque": 0.03, "rest": 0.03}),
+        TermSpec("backlash", "joint", "servo", {"gap": 0.01}),
+    )
+    write_corrected(BENCH, tmp_path / "robot", {}, terms)
+    made = pup(
+        *("record", "step:0.3", "triangle", "chirp", "hold", "--repeats", 2, "--seed", 3),
+        *("--virtual", "--robot", tmp_path / "robot", "--out", tmp_path / "runs"),
+    )
+    assert made.code == 0, made.err
+    measured = Measured.of(BENCH, load_recordings([tmp_path / "runs"], BENCH))
+    space = robot_space(BENCH, "pd")
+    gains = {"kp/servo": 4.163, "kd/servo": 0.0696, "tau_max/servo": 0.876, "armature": 0.001556}
+    free = tuple(nominal_coordinate(space, name) for name in gains)
+    nominal = Fit(free, np.array([c.coordinate(gains[c.name]) for c in free]))
+    nothing = Maker(BENCH).nothing()
+    found = replace(nothing, nominal=replace(nothing.nominal, fit=nominal), measured=measured)
+    kept = Store(tmp_path / "kept", "").around(threads(Bench(measured, "nn_pd"), 1))
+    replays = Replays(measured, robot_space(BENCH, "nn_pd"), kept, 1)
+    noise = Noise(np.array([0.0011, 0.005, 0.005]), np.zeros(3), "repeats")
+    coordinates, start = _start(found, replays.space)
+    monkeypatch.setattr(rivals, "ITERATIONS", 3)  # enough to see that it has left its beginning
+    fit = _fitted(coordinates, start, replays, noise)
+    before, after = replays([fit.row(start), fit.row()])
+    assert _rms(measured, after) < 0.95 * _rms(measured, before)
 
 
 def test_the_diagnosis_beats_both_on_every_type_of_motion(done: Done) -> None:

@@ -104,6 +104,36 @@ def test_the_physics_refuses_what_means_nothing_to_it(
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("effect", "values"),
+    [
+        ("stribeck_friction", "torque = 0.02, rest = 0.03, speed = 0"),
+        ("thermal_drift", "rate = 0.01, time = 0"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_a_speed_or_a_time_of_zero_is_the_limit_of_small_ones(
+    tmp_path: Path, bench_recordings: Path, effect: str, values: str
+) -> None:
+    bench = RobotDescription.load("servo_bench")
+    runs = load_recordings([bench_recordings], bench)
+    term = f'\n[[term]]\neffect = "{effect}"\nplace = {{ kind = "joint", name = "servo" }}\n'
+    positions = []
+    for zero in ("0", "1e-6"):
+        text = f"{term}values = {{ {values.removesuffix('0')}{zero} }}\n"
+        folder = robot_folder(
+            tmp_path / zero,
+            (bench.folder / "robot.toml").read_text() + text,
+            bench.model_path.read_text(),
+        )
+        robot = RobotDescription.load(folder)
+        space = robot_space(robot, "pd")
+        told = MujocoSimulator(robot, runs, "pd").replay(space.candidates(space.nominal[None]))
+        assert not told.diverged.any()
+        positions.append(told.position)
+    assert np.allclose(*positions, atol=1e-4, equal_nan=True)
+
+
 def test_every_verb_refuses_a_term_that_means_nothing_before_it_works(
     tmp_path: Path, bench_recordings: Path
 ) -> None:

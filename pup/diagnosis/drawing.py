@@ -8,7 +8,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 MARKS = (BLUE, GREEN, PURPLE, "#56B4E9", INK, "#882255")
 """Colours of the findings, in their order; the misfit's colours are others."""
+READABLE = 4.5
+"""Contrast of small text that everybody can read (WCAG 2, level AA)."""
 VIEWS = {"from the front": (1, 2), "from the side": (0, 2), "from above": (0, 1)}
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 DIRECTIONS = np.array(
@@ -158,6 +160,14 @@ def draw_robot(
     return as_svg(figure)
 
 
+def ink_on(colour: str) -> str:
+    """The colour of text on another: white where that can be read, else ink."""
+    parts = np.array(to_rgb(colour))
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    luminance = float(linear @ (0.2126, 0.7152, 0.0722))
+    return "white" if 1.05 / (luminance + 0.05) >= READABLE else INK
+
+
 def _draw_view(
     axes: Any,
     pose: Pose,
@@ -217,7 +227,8 @@ def _mark(
         if points is None:
             at = (0.03, 0.95 - 0.1 * (number - 1)) if place.kind != "ground" else (0.03, 0.08)
             axes.text(
-                *at, label, transform=axes.transAxes, color="white", weight="bold", fontsize=8,
+                *at, label, transform=axes.transAxes, color=ink_on(colour), weight="bold",
+                fontsize=8,
                 bbox={"boxstyle": "circle,pad=0.25", "facecolor": colour, "edgecolor": "none"},
             )  # fmt: skip
             continue
@@ -229,8 +240,8 @@ def _mark(
             markeredgecolor=colour, markeredgewidth=2.6, zorder=5,
         )  # fmt: skip
         axes.annotate(
-            label, seen[0], xytext=(17 + 18 * taken, 11), textcoords="offset points", color="white",
-            weight="bold", fontsize=8, zorder=6,
+            label, seen[0], xytext=(17 + 18 * taken, 11), textcoords="offset points",
+            color=ink_on(colour), weight="bold", fontsize=8, zorder=6,
             bbox={"boxstyle": "circle,pad=0.25", "facecolor": colour, "edgecolor": "none"},
         )  # fmt: skip
 

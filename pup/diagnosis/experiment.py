@@ -211,7 +211,7 @@ def recorded_besides(measured: Measured, seed: int = 0) -> NextRecording:
     menu.sort(key=lambda option: option.words not in well)
     known = measured.motions()
     option = next((o for o in menu if o.recording.motion not in known), menu[0])
-    reason = f"{option.words}, beside what was recorded, moves the joints in another way"
+    reason = f"{option.words}, beside what was recorded, would move the joints in another way"
     return NextRecording(
         option.recording.motion, option.words, option.recording.support, {}, False, reason, ()
     )

@@ -16,7 +16,7 @@ EQUATIONS = {
     "target_rate_limit": "|d goal/dt| <= 1/slowness, |d2 goal/dt2| <= 1/sluggishness",
     "command_delay": "target(t) = command(t - d)",
     "measurement_delay": "reading(t) = q(t - d)",
-    "scan_delay": "reading_k(t) = q_k(t - d k/n), or d (n + 1 - k)/n where d < 0",
+    "scan_delay": "reading_k(t) = q_k(t - d k/n), or q_k(t + d (n + 1 - k)/n) where d < 0",
     "actuator_lag": "tau = u - kd qdot, du/dt = (tau_m + kd qdot - u)/T",
     "voltage_sag": "tau_m, tau_max: times s; T ds/dt = 1/(1 + c sum |tau|) - s",
     "thermal_drift": "tau_m, tau_max: times 1 - r h, dh/dt = 1 - h/T; by load: |tau|/tau_max - h/T",

@@ -172,7 +172,8 @@ class _Report:
         shifts = self.speech.shifts(added[0].absorbed_by)
         hidden = f"Your fit hid {it} in the {shifts}. " if shifts else ""
         if diagnosis.held_out is None:
-            yield hidden
+            if hidden:
+                yield hidden.rstrip()
             return
         held = diagnosis.held_out
         low, high = (percent(end) for end in held.interval)
@@ -305,7 +306,10 @@ class _Report:
         )
         worst = max(misfits, key=misfits.__getitem__)
         marked = listed(
-            [f"{i} {self.speech.place(f.place)}" for i, f in enumerate(diagnosis.findings, start=1)]
+            [
+                f"{i} {self.speech.place(f.place, f.effect)}"
+                for i, f in enumerate(diagnosis.findings, start=1)
+            ]
         )
         cause = f"Rings and numbers, the causes: {marked}. " if marked else ""
         yield figure(
@@ -325,11 +329,7 @@ class _Report:
         reason = str(self.next.get("reason", "")).removesuffix(".")
         if reason:
             yield tag("p", f"{capital(reason)}.")
-        pairs = [
-            tag("li", f"{_named(a)} from {_named(b)}")
-            for a, b in self.next.get("splits", ())
-            if a != b
-        ]
+        pairs = [tag("li", f"{_named(a)} from {_named(b)}") for a, b in self.splits() if a != b]
         if pairs:
             yield tag("p", "It would tell")
             yield tag("ul", *pairs)
@@ -337,6 +337,15 @@ class _Report:
             if finding.equivalents:
                 named = self.speech.words(finding.effect, finding.place)
                 yield tag("p", f"{capital(named)}: {otherwise(finding, self.speech)}")
+
+    def splits(self) -> Iterable[tuple[Any, Any]]:
+        """Pairs of effects that it would tell apart."""
+        ask = self.diagnosis.ask
+        if ask is None:
+            told: Iterable[tuple[Any, Any]] = self.next.get("splits", ())
+            return told
+        # The document calls what the contract has no name for unknown, which it is not.
+        return dict.fromkeys((pair.first, pair.second) for pair in ask.splits)
 
     def record_none(self) -> Iterator[Html]:
         """Why nothing is asked for though findings have rivals."""

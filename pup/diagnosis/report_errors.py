@@ -184,7 +184,7 @@ def maps(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
         figure(
             misfit_map(names, regimes, before, norm),
             f"Heat map of errors by joint and regime. {takeaway}",
-            f"Nominal model. {takeaway}",
+            f"{'Nominal model' if fitted else 'Robot as it is described'}. {takeaway}",
         )
     ]
     corrected = summary.models(diagnosis).get("corrected")

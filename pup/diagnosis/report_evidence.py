@@ -16,6 +16,7 @@ from pup.diagnosis.wording import (
     Speech,
     capital,
     change,
+    digits,
     effect_words,
     parameter_words,
     percent,
@@ -210,10 +211,10 @@ def _unseen(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
         rows.append(
             (
                 effect_words(hypothesis.effect),
-                speech.place(hypothesis.place).removeprefix("the "),
+                speech.place(hypothesis.place, hypothesis.effect).removeprefix("the "),
                 f"{quantity_words(quantity.name)}: "
                 + speech.quantity(size * hypothesis.typical[clearest], quantity.unit),
-                f"{size:.1f}" if size < 100 else f"{size:,.0f}",
+                digits(size) if size < 100 else f"{size:,.0f}",
                 percent(trace.absorbed),
             )
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from pup.diagnosis.drawing import MARKS
+from pup.diagnosis.drawing import MARKS, ink_on
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.sentences import sentence
@@ -13,14 +13,15 @@ from pup.sysid.wording import listed
 
 HID = 6
 """Nominal parameters told of those that hid a finding, at most."""
-BADGE = "color: #fff; border-radius: 1em; padding: 0 0.5em; margin-right: 0.5em;"
+BADGE = "border-radius: 1em; padding: 0 0.5em; margin-right: 0.5em;"
 """Looks of a finding's number."""
 
 
 def badge(number: int) -> Html:
     """A finding's number in its colour, as it stands in the drawing."""
     colour = MARKS[(number - 1) % len(MARKS)]
-    return tag("span", str(number), style=f"{BADGE} background: {colour}")
+    looks = f"{BADGE} color: {ink_on(colour)}; background: {colour}"
+    return tag("span", str(number), style=looks)
 
 
 def missing(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from pup.diagnosis import summary
-from pup.diagnosis.figures_missing import Interval, ratio_dots
+from pup.diagnosis.figures_missing import FURTHEST, Interval, ratio_dots
 from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.splits import Ratio, Split
 from pup.diagnosis.wording import Speech, digits, parameter_words, percent, spoken
@@ -118,6 +118,8 @@ def gaps(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     yield tag("p", takeaway)
     shown = told[:ROWS]
     few = f" The {ROWS} surest of {len(told)}." if len(told) > ROWS else ""
+    if any(_outside(gap.before) or (gap.after and _outside(gap.after)) for gap in shown):
+        few += f" Dots beyond {FURTHEST:g} to 1 are outside the picture."
     yield figure(
         ratio_dots(
             [_label(gap) for gap in shown],
@@ -140,14 +142,14 @@ def sentence(gap: Gap) -> str:
     _, here, there = _words(first, second)
     name = f"The {parameter_words(f'{before.parameter}/{gap.group}')}"
     more = (
-        f"{digits(before.value)} times as large {here} as {there}"
+        f"{digits(before.value, 3)} times as large {here} as {there}"
         if before.value > TWICE
         else f"{percent(before.value - 1)} larger {here} than {there}"
     )
     text = f"{name} is {more} (90 % interval of the ratio {_range(before)})"
     if after is None:
         return f"{text}."
-    return f"{text}; with what was found, the ratio is {after.value:.2f} ({_range(after)})."
+    return f"{text}; with what was found, the ratio is {_told(after.value)} ({_range(after)})."
 
 
 def _takeaway(told: Sequence[Gap]) -> str:
@@ -173,8 +175,16 @@ def _interval(ratio: Ratio) -> Interval:
     return ratio.value, ratio.lower, ratio.upper
 
 
+def _outside(ratio: Ratio) -> bool:
+    return not 1 / FURTHEST <= ratio.value <= FURTHEST
+
+
 def _range(ratio: Ratio) -> str:
-    return f"{ratio.lower:.2f} to {ratio.upper:.2f}"
+    return f"{_told(ratio.lower)} to {_told(ratio.upper)}"
+
+
+def _told(value: float) -> str:
+    return f"{value:.2f}" if value < 10 else f"{value:,.0f}"
 
 
 def _inverse(ratio: Ratio) -> Ratio:

@@ -17,7 +17,7 @@ from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.held_out import HeldOut, held_out
 from pup.diagnosis.replays import Replays
-from pup.diagnosis.residuals import LOST, Measured
+from pup.diagnosis.residuals import LOST, Measured, Noise
 from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.selection import Selector
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace
@@ -30,6 +30,9 @@ OUTPUTS = NETWORK_NAMES[15:]
 """Weights and biases of the network's last layer."""
 ITERATIONS, SLACK = 24, 1e-4
 """Steps of NN-PD's fit, at most, and relative gain of chi-squared at which it may end."""
+BEGINNINGS = (Fit.damping, 1.0, 10.0, 100.0)
+"""Dampings that NN-PD's fit begins with, the first that leads anywhere. Its weights' box may bend a
+first step that is damped little until it promises nothing, which looks like an end."""
 LEAST = 0.1
 """Smallest scale of the active damping at the start: at none, a logarithm would stay there."""
 
@@ -132,11 +135,22 @@ def fit_nn_pd(found: Diagnosis, replays: Replays) -> tuple[Array, tuple[float, f
       mean square error on what was fitted, before and after, rad.
     """
     coordinates, start = _start(found, replays.space)
-    fit = Fit(coordinates, start, slack=SLACK)
-    fit_together([fit], replays, found.noise, ITERATIONS)
+    fit = _fitted(coordinates, start, replays, found.noise)
     before, after = replays([fit.row(start), fit.row()])
     predicted = Selector(replays, found.noise, (), 0.0, fit).nominal.predicted
     return predicted, (_rms(found.measured, before), _rms(found.measured, after))
+
+
+def _fitted(
+    coordinates: tuple[Coordinate, ...], start: Array, replays: Replays, noise: Noise
+) -> Fit:
+    fit = Fit(coordinates, start, slack=SLACK)
+    for damping in BEGINNINGS:
+        fit.done, fit.stuck, fit.damping = False, 0, damping
+        fit_together([fit], replays, noise, ITERATIONS)
+        if fit.moved:
+            break
+    return fit
 
 
 def _start(found: Diagnosis, space: ParameterSpace) -> tuple[tuple[Coordinate, ...], Array]:

@@ -43,13 +43,13 @@ class Facts:
     @property
     def at(self) -> str:
         """The place."""
-        return self.speech.place(self.finding.place)
+        return self.speech.place(self.finding.place, self.finding.effect)
 
     @property
     def s(self) -> str:
         """The ending of a verb whose subject is the place."""
         kind = self.finding.place.kind
-        return "" if kind in ("group", "bus") else "s"
+        return "" if kind in ("group", "bus", "robot") else "s"
 
     def along(self) -> str:
         """The components of a vector that matter."""
@@ -295,10 +295,11 @@ def _asymmetric_friction(f: Facts) -> str:
 def _spring(f: Facts) -> str:
     bend = 0.01 if f.speech.slides else np.radians(10)
     pull = f.speech.torque(f.size["stiffness"] * bend)
-    constant = f.speech.torque(f.size["preload"])
+    preload = f.size["preload"]
+    constant = f"{f.speech.torque(abs(preload))} in the {'positive' if preload > 0 else 'negative'}"
     return (
         f"Something like a cable pulls {f.at} back: {pull} for every {f.speech.angle(bend)}, and "
-        f"{constant} all the time."
+        f"{constant} direction all the time."
     )
 
 
@@ -332,7 +333,8 @@ _TEMPLATES: dict[str, Callable[[Facts], str]] = {
     "rising_static_friction": _rising,
     "presliding_hysteresis": _presliding,
     "load_dependent_friction": lambda f: (
-        f"{f.at} lose{f.s} {percent(2 * f.size['share'])} of the load that it carries to friction."
+        f"{f.at} lose{f.s} {percent(2 * f.size['share'])} of the load that "
+        f"{'it carries' if f.s else 'they carry'} to friction."
     ),
     "gear_efficiency": lambda f: (
         f"The gear of {f.at} loses {percent(f.size['loss'])} of the torque it passes on."

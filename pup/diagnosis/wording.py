@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pup.diagnosis.laws import WORDS
-from pup.physics.terms import Place
+from pup.physics.terms import TERMS, Place
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits
 from pup.sysid.wording import listed
@@ -29,6 +29,8 @@ _TOKENS = {
     "el": "elbow",
 }
 _SINGLE = {"ground": "the floor", "sensor": "the IMU", "bus": "all servos", "robot": "the robot"}
+_EVERYWHERE = "all joints"
+"""Where the whole robot is the place of what joints do: these stick and have gears, it does not."""
 _PARAMETERS = {
     "kp": "stiffness kp",
     "kd": "damping kd",
@@ -43,6 +45,9 @@ _QUANTITIES = {
     "slowness": "time per way",
     "sluggishness": "time per speed gained",
     "teeth": "ripples per turn",
+    "behind": "encoder: 1 at the link, 0 at the motor",
+    "lasting": "goes on without torque: 1 yes, 0 no",
+    "load": "grows with the load: 1 yes, 0 with time",
     "astray": "error on motions left out, times the noise",
 }
 SLIDING = {
@@ -78,6 +83,7 @@ def parameter_words(name: str) -> str:
 def effect_words(effect: str) -> str:
     """An effect's name in a label."""
     words = effect.replace("_", " ")
+    words = re.sub("^(coulomb|stribeck)", lambda name: capital(name[0]), words)
     return re.sub("^imu", "IMU", re.sub("^com ", "centre of mass ", words))
 
 
@@ -129,8 +135,10 @@ class Speech:
     robot: RobotDescription
     units: JointUnits
 
-    def place(self, place: Place) -> str:
-        """A place with its article."""
+    def place(self, place: Place, effect: str = "") -> str:
+        """A place, with its article, of an effect that acts there."""
+        if place.kind == "robot" and effect in TERMS and "joint" in TERMS[effect].kinds:
+            return _EVERYWHERE
         if place.kind in _SINGLE:
             return _SINGLE[place.kind]
         if place.kind == "group":
@@ -145,11 +153,11 @@ class Speech:
             return f"the {spoken(place.name)}{link}"
         return f"the {spoken(place.name)}"
 
-    def places(self, places: Sequence[Place]) -> str:
+    def places(self, effect: str, places: Sequence[Place]) -> str:
         """Several places of one effect: groups share their noun, all others their article."""
         if all(place.kind == "group" for place in places):
             return f"the {listed([spoken(place.name) for place in places])} joints"
-        names = [self.place(place) for place in places]
+        names = [self.place(place, effect) for place in places]
         if all(name.startswith("the ") for name in names):
             return f"the {listed([name.removeprefix('the ') for name in names])}"
         return listed(names)
@@ -157,21 +165,21 @@ class Speech:
     def lack(self, effect: str, places: Sequence[Place]) -> str:
         """What a simulator lacks: an effect by its name, at its places."""
         at = "on" if places[0].kind in ("bus", "robot") else "at"
-        return f"{effect_words(effect)} {at} {self.places(places)}"
+        return f"{effect_words(effect)} {at} {self.places(effect, places)}"
 
     def short(self, effect: str, place: Place) -> str:
         """An effect at a place, for a label."""
-        where = self.place(place).removeprefix("the ")
+        where = self.place(place, effect).removeprefix("the ")
         return f"{effect_words(effect)}, {where}"
 
     def heading(self, effect: str, place: Place) -> str:
         """An effect at a place, over a paragraph."""
-        return f"{capital(self.place(place))}: {WORDS[effect]}"
+        return f"{capital(self.place(place, effect))}: {WORDS[effect]}"
 
     def words(self, effect: str, place: Place) -> str:
         """An effect at a place, in a sentence."""
         at = "on" if place.kind in ("bus", "robot") else "at"
-        return f"{WORDS[effect]} {at} {self.place(place)}"
+        return f"{WORDS[effect]} {at} {self.place(place, effect)}"
 
     def channels(self) -> list[str]:
         """What is read: the joints, then the torso's angles."""

@@ -151,7 +151,8 @@ class ThermalDrift(Term):
         """See Term."""
         self._warmth = np.zeros_like(self.values["rate"])
         self._heat = self.values["load"] / self.scene.limit
-        self._cooling = self.scene.timestep / self.values["time"]
+        step = self.scene.timestep
+        self._cooling = step / np.maximum(self.values["time"], step)
 
     def drive(self, drive: Drive) -> None:
         """See Term."""

@@ -93,7 +93,7 @@ class StribeckFriction(Friction):
     def level(self, flow: Flow) -> Array:
         """See Friction."""
         n = len(flow.torque)
-        fade = np.exp(-np.abs(flow.velocity) / self.values["speed"][:n])
+        fade = np.exp(-np.abs(flow.velocity) / np.maximum(self.values["speed"][:n], 1e-9))
         return self.values["torque"][:n] + self.values["rest"][:n] * fade
 
 
