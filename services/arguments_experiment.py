@@ -78,7 +78,10 @@ def _name(text: str) -> str:
 
 
 def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
+    words = tuple(word.strip() for word in text.split(",") if word.strip())
+    if not words:  # none would be read as all, such as where a variable of a shell is empty
+        raise argparse.ArgumentTypeError(f"{text!r} names nothing; leave the option out for all")
+    return words
 
 
 def _seeds(text: str) -> tuple[int, ...]:

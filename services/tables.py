@@ -168,5 +168,6 @@ def experiment_table(shown: dict[str, Any]) -> None:
     for line in shown["experiment"]["acceptance"]:
         robots = f"{line['robots']} of {line['planned']}"
         table.add_row(line["line"], estimated(line), robots, f"{line['bar']:g}", line["answer"])
-    console.print(table)
+    if table.row_count:
+        console.print(table)
     print(f"report: {shown['report']}")

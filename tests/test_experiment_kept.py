@@ -1,5 +1,6 @@
 """What an experiment has found is not deleted for a mistake, nor by two processes at once."""
 
+import shutil
 import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
@@ -77,6 +78,55 @@ def test_a_changed_plan_is_refused_by_the_settings_that_are_other(
     assert f"{out}: 1 finished cells" in refused.err and written(out) == before
     file.write_text(plan)
     assert pup(*asked).code == 0 and written(out) == before
+
+
+DAMAGED = ("", "{", "[]", '{"schema": 1, "stages": []}')
+
+
+@pytest.mark.parametrize("text", DAMAGED)
+def test_a_damaged_journal_is_told_with_what_its_cell_takes(
+    workshop: Workshop, tmp_path: Path, text: str
+) -> None:
+    asked = ("experiment", "--small", *STAGES, "--out", tmp_path)
+    assert pup(*asked).code == 0
+    name = "policy-forward-up"
+    folder = tmp_path / CELLS / name
+    (folder / "run.json").write_text(text)
+    before = written(tmp_path)
+    for more in ((), ("--redo",)):
+        refused = pup(*asked, *more)
+        line = refused.err.splitlines()[-1]
+        assert refused.code == 2 and line.startswith(f"pup experiment: {folder}/run.json: not ")
+        assert line.endswith(f"with its folder {folder} deleted, this cell is done anew")
+        assert written(tmp_path) == before
+    shutil.rmtree(folder)
+    workshop.done.clear()
+    assert pup(*asked).code == 0 and workshop.done == [name]
+
+
+def test_settings_that_a_damaged_journal_does_not_tell_are_others(tmp_path: Path) -> None:
+    for told_ in ('[{"a": 1}', "[]", "3"):
+        assert different({"told": told_}, {"told": '{"a": 1}'}, {}) == ("a",)
+
+
+@pytest.mark.parametrize("text", [None, "", "{", "{}", "[]", '{"by": 3, "host": "a"}'])
+def test_a_result_is_one_without_its_date_too(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str | None
+) -> None:
+    shop = opened(monkeypatch)
+    monkeypatch.setattr("services.experiment.gather._recordings", lambda *_: {})
+    asked = ("experiment", "--small", "--stages", "record", "--local", "--json", "--out", tmp_path)
+    assert pup(*asked).code == 0
+    made = tmp_path / CELLS / "record-r1000" / "made.json"
+    made.unlink()
+    if text is not None:
+        made.write_text(text)
+    again = pup(*asked)
+    assert again.code == 0 and len(shop.done) == 2, again.err
+    cells = again.json()["experiment"]["cells"]
+    assert {cells["record-r1000"][part] for part in ("host", "ended")} == {"unknown"}
+    assert cells["record-r1001"]["host"] != "unknown"
+    assert "unknown" in (tmp_path / "report.html").read_text()
 
 
 def test_what_comes_to_light_on_the_way_deletes_nothing_either(

@@ -76,17 +76,23 @@ REFUSED = {
     "schema = 1\n[trials]\nhorizon = -1": "trials: horizon, and seconds of diagnosis",
     "schema = 1\n[train]\nfleet = '--see 3'": "unrecognized arguments: --see 3",
     "schema = 1\n[record]\nmotions = []": "a motion and a repeat at least",
+    "schema = 1\nwalk = []": "walk: is empty; leave it out for the usual walks",
+    "schema = 1\n[[walk]]\nrobots = 3": "plan.toml: walk[1].direction: missing",
+    "schema = 1\n[train]\nfleet = '--help'": "train: is no training",
     "seeds": "not a TOML document",
 }
 
 
 @pytest.mark.parametrize("text", REFUSED)
-def test_what_a_plan_cannot_say_is_told_in_a_line(tmp_path: Path, text: str) -> None:
+def test_what_a_plan_cannot_say_is_told_in_a_line(
+    tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "plan.toml"
     file.write_text(text)
     with pytest.raises(InputError, match=r"plan\.toml") as told:
         read_plan(file)
     assert REFUSED[text] in str(told.value) and "\n" not in str(told.value)
+    assert str(told.value).count(str(file)) == 1 and not capsys.readouterr().out
 
 
 PLANS = st.builds(
@@ -328,3 +334,18 @@ def test_what_goes_on_from_a_gait_searches_for_none() -> None:
     for name in ("further", "diagnosed"):
         with pytest.raises(InputError, match=f"train: {name} goes on from a gait"):
             replace(small(), train=replace(small().train, **{name: "--pattern 5"}))
+
+
+def test_robots_are_fitted_with_the_torque_law_that_their_policies_know() -> None:
+    """Or the fitted parameters have no eta, as is found after the fleet's training."""
+
+    def of(*stages: str) -> Plan:
+        return replace(small(), presysid=replace(small().presysid, actuator="pd"), stages=stages)
+
+    for stage in ("trials", "prior", "undiagnosed"):
+        with pytest.raises(InputError, match="presysid: actuator 'pd' is another than 'nn_pd' of"):
+            graph(of(stage))
+    assert graph(of("presysid", "policy", "diagnosis", "diagnosed", "corrected"))
+    plan = of("trials")
+    assert graph(replace(plan, fleet=replace(plan.fleet, actuator="pd", compare=False)))
+    assert graph(replace(plan, pooled=True))

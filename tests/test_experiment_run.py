@@ -356,6 +356,15 @@ REFUSED = {
     ("--seeds", "1,1"): "does not name robots, each once",
     ("--cell", "../x"): "is no cell",
     ("--real", "."): "no *.parquet",
+    ("--real", "nowhere"): "--real nowhere: is no folder",
+    ("--stages", ","): "argument --stages: ',' names nothing; leave the option out for all",
+    ("--methods", ""): "argument --methods: '' names nothing; leave the option out for all",
+    (
+        "--plan",
+        "backward.toml",
+        "--methods",
+        "up",
+    ): "--methods: none of these is the plan's, pup, robust",
     ("--small", "--plan", "x"): "not allowed with argument",
 }
 
@@ -365,6 +374,8 @@ def test_mistakes_are_told_in_a_line(
     options: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    walked = "direction = 'backward'\nmethods = ['pup', 'robust']\n"
+    Path("backward.toml").write_text(f"schema = 1\n[[walk]]\n{walked}")
     done = pup("experiment", "--out", tmp_path / "out", "--local", *options)
     assert done.code == 2 and REFUSED[options] in done.err, done.err
     assert "Traceback" not in done.err and not (tmp_path / "out").exists()

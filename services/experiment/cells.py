@@ -11,6 +11,7 @@ from pup.errors import InputError
 from pup.files import sha256
 from pup.policy.bundle import CARD
 from pup.policy.shape import Method
+from pup.recording_file import visible
 from pup.robot import RobotDescription
 from services.experiment.plan import Fits, Plan, Walk, meant
 
@@ -103,7 +104,23 @@ class _Graph:
         wanted = [name for name, cell in self._cells.items() if self._stage(cell) in done]
         cells = chosen(self._cells, wanted)
         self._check_motions(cells)
+        self._check_laws(cells)
         return cells
+
+    def _check_laws(self, cells: Mapping[str, Cell]) -> None:
+        """Refuse fits of robots that cannot tell the eta of policies trained on the fleet's."""
+        own, fleet = self.plan.presysid.actuator, self.plan.fleet.actuator
+        if self.plan.pooled or own == fleet:  # pooled, the fleet's are the robots' own
+            return
+        fits = {f"presysid-r{seed}" for seed in self.plan.seeds}
+        for cell in cells.values():
+            if cell.kind == "trials" and cell.needs.get("bounds") in fits:
+                policy = cells[cell.needs["policy"]]
+                if policy.needs.get("bounds") == FLEET:
+                    raise InputError(
+                        f"presysid: actuator {own!r} is another than {fleet!r} of fleet, on whose "
+                        "bounds policies are trained; write the same in both"
+                    )
 
     def _check_motions(self, cells: Mapping[str, Cell]) -> None:
         """Refuse types of motion that nobody plays, or that a cell would look for in vain."""
@@ -330,7 +347,9 @@ class _Graph:
         self._walked(f"trials-{last}", seed, self.plan.trials.trials, walked)
 
     def _real(self, folder: Path) -> None:
-        files = sorted(folder.glob("*.parquet"))
+        if not folder.is_dir():
+            raise InputError(f"--real {folder}: is no folder; name that of the recordings")
+        files = visible(folder, "*.parquet")
         if not files:
             raise InputError(f"{folder}: no *.parquet in this folder; see `pup import`")
         told: dict[str, Any] = {"recordings": {file.name: sha256(file) for file in files}}

@@ -24,9 +24,18 @@ def different(
     names -= needs.keys() - now.keys()
     others = {needs.get(name, name) for name in names}
     if TOLD in others:
-        settings = set(_settings(*(json.loads(told.get(TOLD, "{}")) for told in (before, now))))
+        settings = set(_settings(_read(before), _read(now)))
         others = others - {TOLD} | settings if settings else others
     return tuple(sorted(others))
+
+
+def _read(inputs: Mapping[str, str]) -> dict[str, Any]:
+    """The settings; none where a damaged journal does not tell them."""
+    try:
+        told = json.loads(inputs.get(TOLD, "{}"))
+    except (TypeError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
 
 
 def _settings(before: Mapping[str, Any], now: Mapping[str, Any], place: str = "") -> Iterator[str]:

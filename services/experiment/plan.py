@@ -98,6 +98,9 @@ class _Refusing(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
 
+    def print_help(self, file: Any = None) -> None:
+        """Nothing: who writes --help into a plan is refused in a line."""
+
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         raise InputError(message or "is no training")
 
@@ -328,8 +331,9 @@ def read_plan(file: Path) -> Plan:
         if parts[name].has("seed"):
             raise parts[name].mistake("seed", "is that of the plan; write it above the tables")
     told: dict[str, Any] = {name: _part(part, getattr(usual, name)) for name, part in parts.items()}
-    walks = table.tables("walk")
-    if walks:
+    if table.has("walk"):
+        if not (walks := table.tables("walk")):
+            raise table.mistake("walk", "is empty; leave it out for the usual walks")
         told["walks"] = tuple(_walk(walk, file) for walk in walks)
     own = _values(table, usual, ("seeds", "pooled", "control", "stages", "seed"))
     table.close()
@@ -343,6 +347,8 @@ def _walk(table: Table, file: Path) -> Walk:
     try:
         direction = Direction(table.text("direction"))
         methods = tuple(map(Method, table.texts("methods"))) if table.has("methods") else ALL
+    except InputError:  # which is a ValueError, and says where
+        raise
     except ValueError as error:
         raise InputError(f"{file}: walk: {error}") from error
     robots = table.integer("robots")

@@ -33,6 +33,8 @@ NEEDS = "needs "
 FILES = "files"
 """Folder of a cell's files, within its own."""
 MADE = "made.json"
+UNKNOWN = "unknown"
+"""When, where or by what a cell was done whose file of that is gone."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Order:
         """Whether it is done, from what those that it needs have found since."""
         if not all((f / RESULT).is_file() for f in self._needed().values()):
             return False
-        return (self.folder / JOURNAL).is_file() and Journal(self.folder).kept(self.stage())
+        return (self.folder / JOURNAL).is_file() and self._journal().kept(self.stage())
 
     @property
     def changed(self) -> tuple[str, ...]:
@@ -86,7 +88,7 @@ class Order:
         if not ((self.folder / JOURNAL).is_file() and (self.files / RESULT).is_file()):
             return ()
         there = {part: f for part, f in self._needed().items() if (f / RESULT).is_file()}
-        before = Journal(self.folder).inputs(self.cell.name)
+        before = self._journal().inputs(self.cell.name)
         return different(before, self._inputs(there), self.cell.needs)
 
     def result(self) -> dict[str, Any]:
@@ -94,12 +96,30 @@ class Order:
         return dict(read_json(self.files / RESULT)["result"])
 
     def made(self) -> dict[str, Any]:
-        """When and by what it was done."""
-        return dict(read_json(self.folder / MADE))
+        """When, where and by what it was done, as far as that is known."""
+        try:
+            told = read_json(self.folder / MADE)
+            by = {"source_sha256": told["by"]["source_sha256"]}
+            return {"by": by, "host": told["host"], "ended": told["ended"]}
+        except (InputError, LookupError, TypeError):  # a result is one without it too
+            return {"by": {"source_sha256": UNKNOWN}, "host": UNKNOWN, "ended": UNKNOWN}
 
     def seconds(self) -> float:
         """That it took, since it was last interrupted."""
-        return Journal(self.folder).done(self.cell.name).seconds
+        return self._journal().done(self.cell.name).seconds
+
+    def _journal(self) -> Journal:
+        """What the cell's folder tells of it.
+
+        Raises:
+          InputError: that is damaged. Nothing else says what its files were made from.
+        """
+        try:
+            return Journal(self.folder)
+        except InputError as error:
+            raise InputError(
+                f"{error}; with its folder {self.folder} deleted, this cell is done anew"
+            ) from error
 
     def _needed(self) -> dict[str, Path]:
         needs = self.cell.needs.items()

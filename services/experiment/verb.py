@@ -71,5 +71,8 @@ def plan_of(options: argparse.Namespace) -> Plan:
     known = tuple(Method)
     if unknown := [m for m in options.methods or () if m not in known]:
         raise InputError(f"--methods: {unknown[0]!r} is unknown; there are {', '.join(known)}")
+    walked = {method for walk in plan.walks for method in walk.methods}
+    if options.methods and not walked.intersection(options.methods):
+        raise InputError(f"--methods: none of these is the plan's, {', '.join(sorted(walked))}")
     plan = plan.of(options.seeds, options.methods)
     return replace(plan, stages=options.stages) if options.stages else plan
