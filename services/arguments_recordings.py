@@ -98,8 +98,8 @@ def record(verb: argparse.ArgumentParser) -> None:
         "motions",
         nargs="+",
         metavar="MOTION",
-        help="step, standup, stand, fall, hold, chirp or triangle; step:0.3 (rad), standup:2 (s) "
-        "and fall:left are single variants",
+        help="step, standup, stand, fall, hold, chirp, triangle or multisine; step:0.3 (rad), "
+        "standup:2 (s) and fall:left are single variants",
     )
     robot(verb, required=True)
     out(verb, "a file per recording or script; it may hold no others")
@@ -114,6 +114,15 @@ def record(verb: argparse.ArgumentParser) -> None:
     actuator(verb)
     verb.add_argument(
         "--repeats", type=number(1, 100), default=1, metavar="N", help="of each motion; default: 1"
+    )
+    verb.add_argument(
+        "--setup",
+        type=knob,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KNOB=NUMBER",
+        help="what is changed on the simulated robot, by its knobs, such as kp=20",
     )
     verb.add_argument("--noiseless", action="store_true", help="perfect sensors and clock")
     verb.add_argument(

@@ -1,6 +1,7 @@
 """`pup record`: motions of a virtual robot, or scripts for a robot to play itself."""
 
 import argparse
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,19 @@ def virtual(options: argparse.Namespace, robot: RobotDescription, out: Path) -> 
         noise=SensorNoise(0.0, 0.0, 0.0, 0.0) if options.noiseless else SensorNoise(),
         repeats=options.repeats,
         truth=options.truth,
+        setup=_setup(options, robot),
     )
     return {"recordings": [str(out / f"{r.id}.parquet") for r in made]}
+
+
+def _setup(options: argparse.Namespace, robot: RobotDescription) -> dict[str, float]:
+    """The knobs that are changed; of two values of one knob neither would be the one meant."""
+    told = Counter(name for name, _ in options.setup)
+    if twice := [name for name, times in told.items() if times > 1]:
+        raise InputError(f"--setup: {twice[0]} is told twice")
+    setup = dict(options.setup)
+    robot.setup(setup)
+    return setup
 
 
 def scripted(options: argparse.Namespace, robot: RobotDescription, out: Path) -> dict[str, Any]:
@@ -40,11 +52,11 @@ def scripted(options: argparse.Namespace, robot: RobotDescription, out: Path) ->
     """
     from pup.sysid.scripts import scripts
 
-    virtual_only = ("actuator", "noiseless", "truth")
+    virtual_only = ("actuator", "noiseless", "truth", "setup")
     given = [f"--{name}" for name in virtual_only if getattr(options, name)]
     given += ["--repeats"] if options.repeats != 1 else []
     if given:
-        more = "; `pup-agent play` has one of its own" if "--repeats" in given else ""
+        more = "; `pup-agent play` has one of its own" * (given[0] in ("--repeats", "--setup"))
         raise InputError(f"{given[0]} is for --virtual alone{more}")
     made = scripts(robot, options.motions, np.random.default_rng(options.seed))
     files = {out / f"{script.id}.json": script for script in made}

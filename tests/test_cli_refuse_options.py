@@ -132,6 +132,22 @@ def _(place: Place) -> Made:
     return place.record("standup"), ("'standup'", "darwin_leg", "can play step")
 
 
+@case("a knob that the robot has not")
+def _(place: Place) -> Made:
+    return place.record("step:0.1", "--setup", "mass=1"), ("'mass' is no knob", "darwin_leg")
+
+
+@case("a knob that is told twice")
+def _(place: Place) -> Made:
+    return place.record("step:0.1", "--setup", "kp=20", "kp=30"), ("--setup: kp", "twice")
+
+
+@case("a knob of a virtual robot for scripts")
+def _(place: Place) -> Made:
+    command = ["record", "step", "--scripts", "--robot", "darwin_leg", "--out", place.out]
+    return [*command, "--setup", "kp=20"], ("--setup is for --virtual", "pup-agent play")
+
+
 @case("a recording without a word of who plays")
 def _(place: Place) -> Made:
     command = ["record", "step", "--robot", "darwin_leg", "--out", place.out]

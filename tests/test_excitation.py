@@ -174,6 +174,17 @@ def test_triangles_are_slow_and_chirps_small(op2: RobotDescription) -> None:
     assert np.median(np.diff(crossings[-8:])) == pytest.approx(0.1, abs=0.04)
 
 
+def test_a_multisine_has_its_tones_and_no_other(op2: RobotDescription) -> None:
+    (motion,) = made(op2, "multisine", jitter=False)
+    joint = int(np.argmax(np.ptp(motion.target, axis=0)))
+    moved = motion.target[:, joint] - motion.target[0, joint]
+    assert np.abs(moved).max() == pytest.approx(0.06, rel=0.02)
+    grown = motion.time >= 1.0
+    waves = np.exp(-2j * np.pi * np.outer(np.arange(1, 31) / 10, motion.time[grown]))
+    size = np.abs(waves @ moved[grown]) / grown.sum()
+    assert set(np.argsort(size)[-5:] + 1) == {3, 7, 11, 17, 23}  # tenths of a hertz
+
+
 def test_holds_come_to_each_pose_from_both_sides(op2: RobotDescription) -> None:
     (motion,) = made(op2, "hold", jitter=False)
     rest = np.all(np.diff(motion.target, axis=0) == 0, axis=1)
@@ -245,7 +256,7 @@ def test_no_kinds_are_refused(op2: RobotDescription) -> None:
 
 @pytest.mark.parametrize("kind", ["standup", "fall", "fall:left"])
 def test_a_robot_on_a_fixed_base_neither_stands_up_nor_falls(kind: str) -> None:
-    with pytest.raises(InputError, match="can play step, hold, chirp, triangle"):
+    with pytest.raises(InputError, match="can play step, hold, chirp, triangle, multisine"):
         made(RobotDescription.load("darwin_leg"), kind)
 
 

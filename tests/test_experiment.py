@@ -18,6 +18,7 @@ from pup.diagnosis.residuals import Noise
 from pup.physics.terms import Place, column
 from pup.physics.terms.scale import Scale
 from pup.robot import RobotDescription
+from pup.sysid.excitation import possible_kinds
 from tests.located import fitted, measured_under, replays_of, settled
 
 BENCH = RobotDescription.load("servo_bench")
@@ -68,6 +69,8 @@ def test_options_are_recordings_the_robot_can_make(robot: RobotDescription) -> N
     assert {"step", "triangle", "chirp", "hold", "multisine", "drop"} <= {
         option.recording.motion for option in menu
     }
+    playable = {*possible_kinds(robot), "drop"}  # whose torque a hand switches off
+    assert {option.recording.motion for option in menu} <= playable
     assert sum(option.plain for option in menu) >= 9
     assert {knob.name for knob in robot.knobs} == {n for o in menu for n in o.setup}
     floors = [option for option in menu if option.other_floor]

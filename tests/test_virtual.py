@@ -280,6 +280,21 @@ def test_one_seed_makes_one_robot_whatever_it_plays(op2: RobotDescription, tmp_p
     assert set(told[0]) == set(robot_space(op2, "nn_pd").names)
 
 
+def test_what_is_changed_on_the_robot_acts_and_is_told(tmp_path: Path) -> None:
+    bench, setup = RobotDescription.load("servo_bench"), {"mass": 0.6}
+    own = concealed_parameters(bench, "pd", np.random.default_rng(1))
+    (usual,), (heavy,) = (
+        record(bench, ["hold"], tmp_path / name, 1, "pd", own, QUIET, jitter=False, setup=changed)
+        for name, changed in (("usual", None), ("heavy", setup))
+    )
+    assert (usual.setup, heavy.setup) == ({}, setup)
+    sag = [float(np.abs(r.target - r.position).max()) for r in (usual, heavy)]
+    assert sag[1] > 1.3 * sag[0]
+    space = nominal_space(bench, "pd").at(own)
+    replayed = MujocoSimulator(bench, [heavy], "pd", lead=2.0).replay(space.candidates())
+    assert replayed.position[0, -1] == pytest.approx(heavy.position[-1], abs=1e-3)
+
+
 def test_record_does_not_mix_with_other_recordings(op2: RobotDescription, tmp_path: Path) -> None:
     record(op2, ("step:0.1",), tmp_path, seed=1)
     record(op2, ("step:0.1",), tmp_path, seed=2)

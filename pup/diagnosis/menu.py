@@ -28,13 +28,12 @@ SCRIPTS = {
     "hold": "holds approached from both sides",
     "standup:2": "a stand-up within 2 s",
     "stand": "shifting the weight while standing",
+    "multisine": "a multisine",
 }
 CHANGED = ("step:0.3", "triangle", "chirp", "hold", "standup:2")
 """Scripts that are also looked at with something else changed."""
 FACTORS = (0.6, 1.6)
 """A knob is turned to these multiples of its default, within its limits."""
-TONES = (0.3, 0.7, 1.1, 1.7, 2.3)
-"""Of a multisine, Hz."""
 OFF = 0.5
 """Time at which a drop's torque goes off, s."""
 DROP = 1.0
@@ -76,7 +75,6 @@ def options(robot: RobotDescription, seed: int = 0) -> list[Option]:
             with suppress(InputError) if kind == "stand" else nullcontext():
                 made[kind] = script(robot, (kind,), np.random.default_rng(seed))[0]
     told = [_option(robot, motion, SCRIPTS[kind]) for kind, motion in made.items()]
-    told.append(_option(robot, _multisine(made["chirp"]), "a multisine"))
     told.append(_drop(robot, made["triangle"]))
     changed = [(made[kind], SCRIPTS[kind]) for kind in CHANGED if kind in made]
     for knob in robot.knobs:
@@ -138,18 +136,6 @@ def _option(
         setup=dict(setup or {}),
     )
     return Option(recording, words)
-
-
-def _multisine(chirp: Motion) -> Motion:
-    """Several tones at once on the straight line that a chirp swings on."""
-    centre, swing = _line(chirp)
-    time = np.arange(round(LASTS / PERIOD), dtype=np.float64) * PERIOD
-    phases = np.pi * np.arange(len(TONES)) ** 2 / len(TONES)  # keeps the peak low (Schroeder)
-    waves = [np.sin(2 * np.pi * tone * time + p) for tone, p in zip(TONES, phases, strict=True)]
-    height = np.sum(waves, axis=0) / np.abs(np.sum(waves, axis=0)).max()
-    height *= np.minimum(time, 1.0)
-    target = centre + height[:, None] * swing
-    return replace(chirp, id="multisine", motion="multisine", time=time, target=target)
 
 
 def _line(motion: Motion) -> tuple[Array, Array]:

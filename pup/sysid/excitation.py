@@ -50,6 +50,10 @@ CHIRP_RANGE = (0.2, 5.0)  # Hz
 CHIRP_AMPLITUDE = 0.06  # rad
 CHIRP_TIME = 12.0  # s
 
+MULTISINE_TONES = (0.3, 0.7, 1.1, 1.7, 2.3)  # Hz
+MULTISINE_TIME = 10.0  # s, in which every tone turns a whole number of times
+MULTISINE_GROWTH = 1.0  # s, in which it reaches its size
+
 TRIANGLE_SPEED = (0.1, 0.2)  # rad/s
 TRIANGLE_AMPLITUDE = 0.2  # rad
 TRIANGLE_CYCLES = 2
@@ -95,7 +99,7 @@ def possible_kinds(robot: RobotDescription) -> tuple[str, ...]:
     """The kinds of motion that a robot can play."""
     poses = {"stand", "squat"} <= robot.poses.keys()
     on_feet = robot.floating and robot.torso is not None and bool(robot.feet) and poses
-    return ("step", *(GROUND if on_feet else ()), "hold", "chirp", "triangle")
+    return ("step", *(GROUND if on_feet else ()), "hold", "chirp", "triangle", "multisine")
 
 
 def script(
@@ -108,9 +112,9 @@ def script(
 
     Args:
       robot: who is to play them.
-      kinds: `step`, `standup`, `stand`, `fall`, `hold`, `chirp` or `triangle`. One with variants
-        may name one after a colon, as `step:0.3` (rad), `standup:2` (s) or `fall:left`; without
-        it stands for all of the paper's. Every entry is drawn anew.
+      kinds: `step`, `standup`, `stand`, `fall`, `hold`, `chirp`, `triangle` or `multisine`. One
+        with variants may name one after a colon, as `step:0.3` (rad), `standup:2` (s) or
+        `fall:left`; without it stands for all of the paper's. Every entry is drawn anew.
       rng: source of all that is random.
       jitter: ticks at random intervals of 25 to 33 Hz instead of a steady 30 Hz.
 
@@ -316,6 +320,24 @@ def _chirp(robot: RobotDescription, rng: np.random.Generator) -> _Course:
     return _Course(at, LEAD + CHIRP_TIME)
 
 
+def _multisine(robot: RobotDescription, rng: np.random.Generator) -> _Course:
+    centre, swing = _swing(robot, rng, CHIRP_AMPLITUDE)
+
+    def waves(time: Array) -> Array:
+        phases = np.pi * np.arange(len(MULTISINE_TONES)) ** 2 / len(MULTISINE_TONES)
+        # Phases after Schroeder (1970), by which the sum's peak is low.
+        turns = 2 * np.pi * time[:, None] * MULTISINE_TONES + phases
+        return np.asarray(np.sin(turns).sum(axis=1))
+
+    peak = np.abs(waves(np.arange(0.0, MULTISINE_TIME, PERIOD))).max()
+
+    def at(time: Array) -> Array:
+        height = np.clip(waves(time) / peak, -1.0, 1.0) * np.minimum(time / MULTISINE_GROWTH, 1.0)
+        return np.asarray(centre + height[:, None] * swing)
+
+    return _Course(at, MULTISINE_TIME)
+
+
 def _triangle(robot: RobotDescription, rng: np.random.Generator) -> _Course:
     centre, swing = _swing(robot, rng, TRIANGLE_AMPLITUDE)
     quarter = TRIANGLE_AMPLITUDE / rng.uniform(*TRIANGLE_SPEED)
@@ -351,5 +373,6 @@ _ALONE: dict[str, _Make] = {
     "hold": _hold,
     "chirp": _chirp,
     "triangle": _triangle,
+    "multisine": _multisine,
 }
 """Kinds without variants."""

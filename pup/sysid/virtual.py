@@ -5,7 +5,7 @@ parameters is the sensors' noise. A real robot, or a case of a blind test, has p
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +120,7 @@ def record_virtual(
     rng: np.random.Generator,
     noise: SensorNoise = SensorNoise(),
     repeats: int = 1,
+    setup: Mapping[str, float] | None = None,
 ) -> tuple[Recording, ...]:
     """Record scripts on a virtual robot.
 
@@ -135,6 +136,7 @@ def record_virtual(
       rng: source of the noise.
       noise: its sensors and clock.
       repeats: how often each motion is recorded; `repeat_of` names the first time.
+      setup: what is changed on the robot, by its knobs.
 
     Raises:
       InputError: a parameter the actuator does not have, or values under which the simulation
@@ -145,7 +147,9 @@ def record_virtual(
     if unknown:
         raise InputError(f"parameter {unknown[0]!r}: the {actuator} actuator has none of that name")
     plans = [
-        _plan(robot, motion, turn, noise, rng) for motion in motions for turn in range(repeats)
+        replace(_plan(robot, motion, turn, noise, rng), setup=dict(setup or {}))
+        for motion in motions
+        for turn in range(repeats)
     ]
     simulator = MujocoSimulator(robot, plans, actuator, lead=SETTLING)
     seen = simulator.replay(space.at(parameters).candidates())
@@ -220,6 +224,7 @@ def _measured(
         position=position[:end],
         extras=extras,
         repeat_of=plan.repeat_of,
+        setup=plan.setup,
         notes=plan.notes,
     )
 
@@ -243,6 +248,7 @@ def record(
     jitter: bool = True,
     repeats: int = 1,
     truth: Path | None = None,
+    setup: Mapping[str, float] | None = None,
 ) -> tuple[Recording, ...]:
     """Make scripts, record them on a virtual robot and write the recordings.
 
@@ -259,6 +265,7 @@ def record(
       jitter: whether ticks come at random intervals of 25 to 33 Hz.
       repeats: how often each motion is recorded.
       truth: file to reveal the parameters in; they stay concealed when None.
+      setup: what is changed on the robot, by its knobs.
     """
     own, scripted, sensed = (
         np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
@@ -266,7 +273,7 @@ def record(
     if parameters is None:
         parameters = concealed_parameters(robot, actuator, own)
     motions = script(robot, kinds, scripted, jitter)
-    recordings = record_virtual(robot, motions, actuator, parameters, sensed, noise, repeats)
+    recordings = record_virtual(robot, motions, actuator, parameters, sensed, noise, repeats, setup)
     names = {f"{recording.id}.parquet" for recording in recordings}
     found = sorted(folder.glob("*.parquet"))
     others = [file.name for file in found if file.name not in names or not _simulated(file)]
