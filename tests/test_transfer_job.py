@@ -141,7 +141,7 @@ def test_attended_a_study_goes_on_without_results_but_not_for_ever(
         settings["agent"] = agent.name
         token = service.tokens["operator"]
         wanted = transfer.Wanted(tmp_path / "policy", name, service.url, token, settings)
-        return transfer.transfer(wanted, tmp_path, lambda line: None, attend)
+        return transfer.transfer(wanted, tmp_path / name, lambda line: None, attend)
 
     agent.walk = walk
     told = [(t["state"], t["attempt"]) for t in study(f"{agent.name}-a")["trials"]]
