@@ -48,15 +48,7 @@ def import_logs(verb: argparse.ArgumentParser) -> None:
     told.add_argument("--motion", help="motion type, such as step, hold or walk")
     told.add_argument("--support", choices=("suspended", "ground", "bench"))
     told.add_argument("--source", choices=("hardware", "simulation", "unknown"))
-    told.add_argument(
-        "--setup",
-        type=knob,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KNOB=NUMBER",
-        help="what was knowingly changed on the robot, by its knobs",
-    )
+    _setup(told, "what was knowingly changed on the robot, by its knobs")
     told.add_argument(
         "--repeat-of", metavar="ID", help="of the recording that this one repeats; for one log"
     )
@@ -92,6 +84,19 @@ def export(verb: argparse.ArgumentParser) -> None:
     cores(replayed)
 
 
+def _setup(group: argparse._ActionsContainer, help: str) -> None:
+    """Knobs of a robot and their values."""
+    group.add_argument(
+        "--setup",
+        type=knob,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KNOB=NUMBER",
+        help=help,
+    )
+
+
 def record(verb: argparse.ArgumentParser) -> None:
     """What a robot does."""
     verb.add_argument(
@@ -115,15 +120,7 @@ def record(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--repeats", type=number(1, 100), default=1, metavar="N", help="of each motion; default: 1"
     )
-    verb.add_argument(
-        "--setup",
-        type=knob,
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KNOB=NUMBER",
-        help="what is changed on the simulated robot, by its knobs, such as kp=20",
-    )
+    _setup(verb, "what is changed on the simulated robot, by its knobs, such as kp=20")
     verb.add_argument("--noiseless", action="store_true", help="perfect sensors and clock")
     verb.add_argument(
         "--truth", type=Path, metavar="FILE", help="reveal the robot's parameters in this file"

@@ -5,8 +5,8 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -23,13 +23,26 @@ pytest.importorskip("mujoco")
 
 
 @contextmanager
-def echoing(bus: Path) -> Iterator[str]:
-    """A half-duplex adapter on a bus: whoever sends hears that, too."""
+def device(serve: Callable[[int, threading.Event], None]) -> Iterator[str]:
+    """A serial port behind which a thread serves a file descriptor until it is to end."""
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     ended = threading.Event()
+    thread = threading.Thread(target=serve, args=(ours, ended))
+    thread.start()
+    try:
+        yield os.ttyname(theirs)
+    finally:
+        ended.set()
+        thread.join()
+        os.close(ours)
+        os.close(theirs)
 
-    def pass_on() -> None:
+
+def echoing(bus: Path) -> AbstractContextManager[str]:
+    """A half-duplex adapter on a bus: whoever sends hears that, too."""
+
+    def pass_on(ours: int, ended: threading.Event) -> None:
         with serial.Serial(str(bus), 1_000_000, timeout=0) as far:
             while not ended.is_set():
                 ready, _, _ = select.select([far.fileno(), ours], [], [], 0.05)
@@ -40,15 +53,7 @@ def echoing(bus: Path) -> Iterator[str]:
                 if far.fileno() in ready:
                     os.write(ours, far.read(4096))
 
-    thread = threading.Thread(target=pass_on)
-    thread.start()
-    try:
-        yield os.ttyname(theirs)
-    finally:
-        ended.set()
-        thread.join()
-        os.close(ours)
-        os.close(theirs)
+    return device(pass_on)
 
 
 @pytest.mark.parametrize("protocol", [1, 2])
@@ -90,29 +95,17 @@ def test_a_bus_where_nobody_answers_says_what_to_look_at(tmp_path: Path) -> None
         one.close()
 
 
-@contextmanager
-def chip(answers: Iterator[bytes]) -> Iterator[str]:
+def chip(answers: Iterator[bytes]) -> AbstractContextManager[str]:
     """A BNO055 that is configured as it should be, and then answers like this."""
-    ours, theirs = os.openpty()
-    tty.setraw(theirs)
-    ended = threading.Event()
 
-    def answer() -> None:
+    def answer(ours: int, ended: threading.Event) -> None:
         while not ended.is_set():
             if select.select([ours], [], [], 0.05)[0]:
                 _, writes, _, length = os.read(ours, 64)[:4]
                 found = b"\xbb\x01\xa0" if length == 1 else next(answers)
                 os.write(ours, b"\xee\x01" if writes == 0 else found)
 
-    thread = threading.Thread(target=answer)
-    thread.start()
-    try:
-        yield os.ttyname(theirs)
-    finally:
-        ended.set()
-        thread.join()
-        os.close(ours)
-        os.close(theirs)
+    return device(answer)
 
 
 def test_an_answer_of_the_imu_that_lost_bytes_is_none() -> None:
