@@ -26,8 +26,6 @@ IMU_COLUMNS = (
     *("imu/roll", "imu/pitch", "imu/yaw"),
     *(f"imu/{kind}_{axis}" for kind in ("gyro", "accel") for axis in "xyz"),
 )
-EDGE = 1.0 + 1e-6
-"""Of a projection, which is a hyperbolic tangent."""
 LONGEST = 120
 """Characters of a recording's id."""
 KINDS = ("target", "position", "velocity", "load", "temperature")
@@ -75,8 +73,7 @@ class Rollout:
         card = policy.card
         if len(eta) != card.shape.eta:
             raise InputError(f"eta has {len(eta)} numbers; the policy takes {card.shape.eta}")
-        if card.shape.latent and not all(abs(x) <= EDGE for x in eta):
-            # The card's box is of a sample of projections; a fitted robot's may lie beyond it.
+        if not card.projected(eta):
             raise InputError(f"eta {list(eta)} is outside -1 to 1, where all projections lie")
         card.check_rate(rate)
         self._policy, self._eta = policy, np.array(eta, dtype=np.float64)

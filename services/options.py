@@ -2,10 +2,11 @@
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from pup.errors import InputError
 from pup.robot import built_in_robots
 
 
@@ -201,6 +202,18 @@ def knob(text: str) -> tuple[str, float]:
     if not name:
         raise argparse.ArgumentTypeError(f"{text!r} is not KNOB=NUMBER")
     return name, number
+
+
+def knobs(given: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """The knobs of --setup, each once."""
+    setup: dict[str, float] = {}
+    for name, value in given:
+        if name in setup:
+            raise InputError(
+                f"--setup: {name} is given twice, {setup[name]:g} and {value:g}; give it once"
+            )
+        setup[name] = value
+    return setup
 
 
 def count(text: str) -> tuple[str, int]:

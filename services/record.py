@@ -1,7 +1,6 @@
 """`pup record`: motions of a virtual robot, or scripts for a robot to play itself."""
 
 import argparse
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from pup.errors import InputError
 from pup.robot import RobotDescription
+from services.options import knobs
 
 
 def virtual(options: argparse.Namespace, robot: RobotDescription, out: Path) -> dict[str, Any]:
@@ -19,6 +19,8 @@ def virtual(options: argparse.Namespace, robot: RobotDescription, out: Path) -> 
     """
     from pup.sysid.virtual import SensorNoise, record
 
+    setup = knobs(options.setup)
+    robot.setup(setup)  # refuses knobs that it has not
     made = record(
         robot,
         options.motions,
@@ -28,19 +30,9 @@ def virtual(options: argparse.Namespace, robot: RobotDescription, out: Path) -> 
         noise=SensorNoise(0.0, 0.0, 0.0, 0.0) if options.noiseless else SensorNoise(),
         repeats=options.repeats,
         truth=options.truth,
-        setup=_setup(options, robot),
+        setup=setup,
     )
     return {"recordings": [str(out / f"{r.id}.parquet") for r in made]}
-
-
-def _setup(options: argparse.Namespace, robot: RobotDescription) -> dict[str, float]:
-    """The knobs that are changed; of two values of one knob neither would be the one meant."""
-    told = Counter(name for name, _ in options.setup)
-    if twice := [name for name, times in told.items() if times > 1]:
-        raise InputError(f"--setup: {twice[0]} is told twice")
-    setup = dict(options.setup)
-    robot.setup(setup)
-    return setup
 
 
 def scripted(options: argparse.Namespace, robot: RobotDescription, out: Path) -> dict[str, Any]:

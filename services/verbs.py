@@ -6,7 +6,7 @@ Imports of what takes long stand inside the verbs: `pup --help` needs none of it
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ from pup.errors import InputError, how_to_install
 from pup.robot import RobotDescription
 from services import places
 from services.held import held
+from services.options import knobs
 
 
 def _run(options: argparse.Namespace) -> dict[str, Any]:
@@ -238,7 +239,7 @@ def _import(options: argparse.Namespace) -> dict[str, Any]:
             support=options.support,
             source=options.source,
             repeat_of=options.repeat_of,
-            setup=_setup(options.setup),
+            setup=knobs(options.setup),
             notes=options.notes,
             joints=tuple(map(str.strip, options.joints.split(","))) if options.joints else (),
             state_topic=options.state_topic,
@@ -370,18 +371,6 @@ def _folder(path: Path) -> Iterator[Path]:
         with suppress(OSError):  # some are not empty
             for folder in made:
                 folder.rmdir()
-
-
-def _setup(given: Sequence[tuple[str, float]]) -> dict[str, float]:
-    """The knobs of --setup, each once."""
-    setup: dict[str, float] = {}
-    for knob, value in given:
-        if knob in setup:
-            raise InputError(
-                f"--setup: {knob} is given twice, {setup[knob]:g} and {value:g}; give it once"
-            )
-        setup[knob] = value
-    return setup
 
 
 VERBS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {

@@ -111,9 +111,16 @@ class PolicyCard:
             raise InputError(
                 f"{len(eta)} numbers, but the policy is conditioned on {self.shape.eta}"
             )
-        if self.shape.latent and not all(abs(x) <= EDGE for x in eta):
+        if not self.projected(eta):
             told = ",".join(f"{x:g}" for x in eta)
             raise InputError(f"{told} is outside -1 to 1, where all projections lie")
+
+    def projected(self, eta: Sequence[float]) -> bool:
+        """Whether something may project to an eta, where etas are projections.
+
+        The card's box is of a sample of projections; a fitted robot's may lie beyond it.
+        """
+        return not self.shape.latent or all(abs(x) <= EDGE for x in eta)
 
     def document(self) -> dict[str, Any]:
         """The card as JSON values."""
