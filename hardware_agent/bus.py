@@ -15,7 +15,7 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from numpy.typing import NDArray
 
 from hardware_agent.config import BusSettings
-from hardware_agent.keeping import MODEL, kept, put_right
+from hardware_agent.keeping import MODEL, check_model, kept, put_right
 from hardware_agent.line import Line
 from hardware_agent.mounting import Mounting
 from hardware_agent.plausible import Plausible
@@ -105,12 +105,15 @@ class Bus(Line):
         if self.settings.board:
             self._switch_on(self.settings.board)
         self.torque(False)
-        missing = [name for name in self.ids if self.register(name, MODEL) is None]
+        models = {name: self.register(name, MODEL) for name in self.ids}
+        missing = [name for name, model in models.items() if model is None]
         if missing:
             told, how = ", ".join(map(str, missing)), self.settings
             known = f"; do they have current, baud {how.baud} and protocol {how.protocol}?"
             hint = known if len(missing) == len(self.ids) else ""
             raise BusError(f"{how.port}: no answer from servo {told}{hint}")
+        for name, model in models.items():
+            check_model(self, name, model)
         changed = [told for name in self.ids for told in put_right(self, name)]
         for name in self.ids:
             own = kept(self, name)

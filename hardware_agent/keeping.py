@@ -25,6 +25,31 @@ class Kept:
     power: int
 
 
+def check_model(line: Line, name: int, model: int | None) -> None:
+    """Refuse a servo that is none of those that the agent drives.
+
+    Args:
+      line: to the servo, open and owned.
+      name: the servo's id.
+      model: what it says it is.
+
+    Raises:
+      InputError: it is of another model, or an adapter echoes.
+    """
+    own, port = line.registers, line.settings.port
+    if own.protocol == 1 and model == int.from_bytes(bytes(MODEL), "little"):
+        # With Protocol 1.0 a question that comes back passes for an answer: address and length.
+        raise InputError(
+            f"{port}: what is sent to servo {name} comes back as its answer; switch "
+            "the adapter's echo off, or use one that has none"
+        )
+    if model != own.model:
+        raise InputError(
+            f"{port}: servo {name} is of model {model}, not an MX-28 with Protocol "
+            f"{own.protocol}.0 (model {own.model}); see [bus] protocol"
+        )
+
+
 def put_right(line: Line, name: int) -> list[str]:
     """Put right what a limp servo has kept, and is not told whenever it shall hold.
 
@@ -37,21 +62,8 @@ def put_right(line: Line, name: int) -> list[str]:
 
     Raises:
       BusError: it does not take a setting.
-      InputError: it is of another model, or an adapter echoes.
     """
     own, where = line.registers, f"{line.settings.port}: servo {name}"
-    model = line.register(name, MODEL)
-    if own.protocol == 1 and model == int.from_bytes(bytes(MODEL), "little"):
-        # With Protocol 1.0 a question that comes back passes for an answer: address and length.
-        raise InputError(
-            f"{line.settings.port}: what is sent to servo {name} comes back as its answer; switch "
-            "the adapter's echo off, or use one that has none"
-        )
-    if model != own.model:
-        raise InputError(
-            f"{where} is of model {model}, not an MX-28 with Protocol {own.protocol}.0 "
-            f"(model {own.model}); see [bus] protocol"
-        )
     changed = []
     for told, span, wanted in (
         ("return delay", own.return_delay, 0),

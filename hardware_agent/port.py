@@ -94,7 +94,10 @@ class Port(PortHandler):  # type: ignore[misc]  # the SDK has no types
         left = self._deadline - time.monotonic()
         if left > 0:
             select.select([self.ser.fileno()], [], [], left)
-        read: bytes = self.ser.read(length)
+        try:
+            read: bytes = self.ser.read(length)
+        except serial.SerialException:  # a kernel may say a moment early that bytes are there
+            read = self.ser.read(length)  # and a port that was pulled fails again
         return read
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802

@@ -16,7 +16,7 @@ from virtual_robots import BOARD, IDS, virtual_robot
 from hardware_agent.bus import Bus
 from hardware_agent.config import BusSettings, ImuSettings
 from hardware_agent.imu import Bno055, Uart
-from hardware_agent.port import BusError
+from hardware_agent.port import BusError, Port
 from pup.errors import InputError
 
 pytest.importorskip("mujoco")
@@ -93,6 +93,39 @@ def test_a_bus_where_nobody_answers_says_what_to_look_at(tmp_path: Path) -> None
         with pytest.raises(BusError, match=f"no answer from servo {IDS[3]}$"):
             one.open()
         one.close()
+
+
+def test_bytes_that_are_told_a_moment_early_are_waited_for_and_a_pulled_port_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Linux may call a terminal readable too early, and pyserial takes that for its end."""
+    hollow = 1
+    read = os.read
+    opened = threading.Event()
+
+    def early(descriptor: int, length: int) -> bytes:
+        nonlocal hollow
+        hollow -= 1
+        return b"" if hollow >= 0 else read(descriptor, length)
+
+    def answer(ours: int, ended: threading.Event) -> None:
+        opened.wait(20)
+        os.write(ours, b"abc")
+        ended.wait()
+
+    with device(answer) as path:
+        port = Port(path, 1_000_000, timeout=5.0)
+        port.open()
+        opened.set()
+        port.setPacketTimeout(3)
+        monkeypatch.setattr("serial.serialposix.os.read", early)
+        assert port.readPort(3) == b"abc"
+        hollow = 2
+        monkeypatch.setattr("serial.serialposix.select.select", lambda *told: (told[0][:1], [], []))
+        with pytest.raises(serial.SerialException):
+            port.readPort(3)
+        monkeypatch.undo()
+        port.close()
 
 
 def chip(answers: Iterator[bytes]) -> AbstractContextManager[str]:
