@@ -393,6 +393,8 @@ def check_together(settings: Settings, file: Path) -> None:
     Raises:
       InputError: see the message.
     """
+    if settings.imu.kind.startswith("bno055") and settings.imu.port == settings.bus.port:
+        raise InputError(f"{file}: imu.port: is that of the servo bus; the IMU has one of its own")
     if settings.imu.kind == "cm740" and not settings.bus.board:
         raise InputError(f'{file}: imu.kind: "cm740" is the board\'s; write its id as bus.board')
     rate, late, timeout = settings.control.rate, settings.safety.late, settings.watchdog.timeout

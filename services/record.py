@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pup.errors import InputError
+from pup.files import read_json
 from pup.robot import RobotDescription
 from services.options import knobs
 
@@ -40,7 +41,7 @@ def scripted(options: argparse.Namespace, robot: RobotDescription, out: Path) ->
 
     Raises:
       InputError: the robot cannot play a motion, an option is a virtual robot's, or the folder
-        holds other files.
+        holds other files or other scripts.
     """
     from pup.sysid.scripts import scripts
 
@@ -54,6 +55,9 @@ def scripted(options: argparse.Namespace, robot: RobotDescription, out: Path) ->
     files = {out / f"{script.id}.json": script for script in made}
     if others := sorted(set(out.glob("*.json")) - files.keys()):
         raise InputError(f"{out}: holds other files ({others[0].name}); use an empty folder")
+    for file, script in files.items():
+        if file.exists() and read_json(file) != script.document():
+            raise InputError(f"{file}: is another script, or of another seed; use an empty folder")
     for file, script in files.items():
         script.write(file)
     return {"scripts": [str(file) for file in files]}

@@ -183,9 +183,11 @@ def transfer(
             "no eta to search; give one of `pup train --method pup` or `up`"
         )
     digest = sha256(wanted.policy / CARD)
-    _check_same(out / FILE, wanted.study, digest)
+    begun = _begun(out / FILE, wanted.study, digest)
     _check_rivals(card, wanted.settings.get("compare", ()))
     gateway = Gateway(wanted.url, wanted.token, told)
+    if begun is not None:
+        _check_known(gateway, wanted.study, begun, out / FILE)
     asked = {
         "name": wanted.study,
         "robot": card.robot,
@@ -211,13 +213,31 @@ def transfer(
         time.sleep(PERIOD)
 
 
-def _check_same(file: Path, study: str, policy: str) -> None:
-    """Refuse to write over another study: its walks may be told nowhere else."""
+def _begun(file: Path, study: str, policy: str) -> object:
+    """When the study of a file was made; None where there is no file.
+
+    Raises:
+      InputError: it is of another study, whose walks may be told nowhere else.
+    """
     if not file.exists():
-        return
+        return None
     told = read_json(file)
     if not isinstance(told, dict) or (told.get("study"), told.get("policy")) != (study, policy):
         raise InputError(f"{file}: is of another study, or of another policy; use another --out")
+    try:
+        return told["history"][0]["time"]
+    except (KeyError, IndexError, TypeError) as error:
+        raise InputError(f"{file}: is damaged; restore or delete it") from error
+
+
+def _check_known(gateway: Gateway, study: str, begun: object, file: Path) -> None:
+    """Refuse to write over a study of the same name that another gateway had."""
+    try:
+        first = gateway.get(f"/v1/studies/{study}/history", limit=1)["events"]
+    except InputError as error:
+        raise InputError(f"{file}: cannot be gone on with; use another --out ({error})") from error
+    if [event["time"] for event in first] != [begun]:
+        raise InputError(f"{file}: is of another study of this name; use another --out")
 
 
 def _check_rivals(card: PolicyCard, compare: Sequence[Sequence[float]]) -> None:

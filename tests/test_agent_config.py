@@ -1,6 +1,6 @@
 """`agent.toml`: every mistake is told in one line, and `pup-agent` exits with 2."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -136,6 +136,13 @@ def test_a_board_with_the_id_of_a_servo_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"bus.board: 20 is the servo of head_tilt; a CM-740"):
         Body(read(tmp_path, changed(WHOLE, "[bus]\nboard = 20")), DARWIN)
     Body(read(tmp_path, changed(WHOLE, "[bus]\nboard = 0")), DARWIN)
+
+
+def test_an_imu_on_the_port_of_the_servos_is_refused(tmp_path: Path) -> None:
+    settings = read(tmp_path, WHOLE)
+    together = replace(settings, imu=replace(settings.imu, port=settings.bus.port))
+    with pytest.raises(InputError, match=r"imu\.port: is that of the servo bus"):
+        check_together(together, tmp_path / "agent.toml")
 
 
 def test_a_file_in_the_sockets_place_is_left_alone(tmp_path: Path) -> None:

@@ -59,11 +59,39 @@ def test_record_writes_recordings_of_a_virtual_robot(tmp_path: Path, check: Chec
     assert json.loads((tmp_path / "truth.json").read_text())["robot"] == "servo_bench"
 
 
+def test_record_writes_its_truth_again_and_over_nothing_else(tmp_path: Path) -> None:
+    truth = tmp_path / "truth.json"
+    command = ("record", "step:0.1", "--virtual", "--robot", "servo_bench", "--truth", truth)
+    for _ in range(2):
+        assert pup(*command, "--out", tmp_path / "rec").code == 0
+    for other in ('{"schema": 1}', "[robot]"):
+        truth.write_text(other)
+        done = pup(*command, "--out", tmp_path / "other")
+        assert done.code == 2 and "holds something else; name another file" in done.err
+        assert truth.read_text() == other and not (tmp_path / "other").exists()
+
+
 def test_record_writes_scripts_for_a_robot_to_play(tmp_path: Path) -> None:
-    done = pup("record", "step:0.1", "--scripts", "--robot", "darwin_leg", "--out", tmp_path)
-    assert done.code == 0, done.err
-    assert done.out.splitlines() == [str(tmp_path / "step_0.1.json")]
-    assert (tmp_path / "step_0.1.json").is_file()
+    command = (
+        "record",
+        "step:0.1",
+        "chirp",
+        "--scripts",
+        "--robot",
+        "darwin_leg",
+        "--out",
+        tmp_path,
+    )
+    for _ in range(2):
+        done = pup(*command)
+        assert done.code == 0, done.err
+    assert done.out.splitlines() == [
+        str(tmp_path / f"{name}.json") for name in ("step_0.1", "chirp")
+    ]
+    made = files(tmp_path)
+    other = pup(*command, "--seed", 5)
+    assert other.code == 2 and "is another script, or of another seed" in other.err
+    assert files(tmp_path) == made
 
 
 def test_record_again_writes_the_same(tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ REFUSED = {
     "schema = 1\n[[walk]]\ndirection = 'up'": "'up' is not a valid Direction",
     "schema = 1\n[[walk]]\ndirection = 'forward'\nmethods = ['x']": "'x' is not a valid Method",
     "schema = 1\n[[walk]]\ndirection = 'forward'\nrobots = 0": "needs a method and a robot",
+    "schema = 1\nseeds = [1]\n[[walk]]\ndirection = 'forward'\nrobots = 3": "3, but seeds are 1",
     "schema = 1\n[[walk]]\ndirection = 'forward'\n[[walk]]\ndirection = 'forward'": "stands twice",
     "schema = 1\n[diagnosis]\neffects = 0": "diagnosis: effects must be 1 or more",
     "schema = 1\npooled = true": "pooled: needs fixed_network in presysid",

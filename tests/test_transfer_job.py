@@ -69,6 +69,17 @@ def test_a_study_is_followed_to_its_end(robot, tmp_path):
     assert again.code == 0 and again.out.startswith("eta: ") and len(agent.journal.walked) == 8
     other = pup(*command, *SMALL, "--seed", 3)
     assert other.code == 2 and "other settings" in other.err
+    file = tmp_path / "study.json"
+    for known, why in (
+        (told["study"], "another study of this name"),
+        ("gone", "cannot be gone on"),
+    ):
+        elsewhere = told | {"study": known}
+        elsewhere["history"][0]["time"] -= 1.0
+        file.write_text(json.dumps(elsewhere))
+        refused = pup(*command, *SMALL, "--study", known)
+        assert refused.code == 2 and why in refused.err and "use another --out" in refused.err
+        assert json.loads(file.read_text()) == elsewhere
 
 
 def test_a_search_ends_once_no_walk_is_worth_it(robot, tmp_path):

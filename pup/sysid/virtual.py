@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.files import write_json
+from pup.files import read_json, write_json
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.simulator import Trajectories
@@ -34,6 +34,10 @@ LIMIT_SPREAD = (0.52, 1.22)  # times nominal, of the torque limit: 6 to 14 N m i
 FRICTION_RANGE = (0.5, 1.2)
 COM_SPREAD = 0.02  # m
 SHARE = 0.15  # of the search range to both sides of the nominal value, of everything else
+
+
+TRUTH = frozenset(("schema", "robot", "actuator", "seed", "parameters"))
+"""Keys of a file that reveals a virtual robot's parameters."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +241,15 @@ def _simulated(file: Path) -> bool:
         return False
 
 
+def _reveals(file: Path) -> bool:
+    """Whether a file is the truth of a virtual robot, which can be written again."""
+    try:
+        told = read_json(file)
+    except InputError:
+        return False
+    return isinstance(told, dict) and told.keys() == TRUTH
+
+
 def record(
     robot: RobotDescription,
     kinds: Sequence[str],
@@ -267,6 +280,8 @@ def record(
       truth: file to reveal the parameters in; they stay concealed when None.
       setup: what is changed on the robot, by its knobs.
     """
+    if truth is not None and truth.exists() and not _reveals(truth):
+        raise InputError(f"{truth}: holds something else; name another file for the truth")
     own, scripted, sensed = (
         np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
     )

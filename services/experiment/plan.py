@@ -331,11 +331,12 @@ def read_plan(file: Path) -> Plan:
         if parts[name].has("seed"):
             raise parts[name].mistake("seed", "is that of the plan; write it above the tables")
     told: dict[str, Any] = {name: _part(part, getattr(usual, name)) for name, part in parts.items()}
+    own = _values(table, usual, ("seeds", "pooled", "control", "stages", "seed"))
     if table.has("walk"):
         if not (walks := table.tables("walk")):
             raise table.mistake("walk", "is empty; leave it out for the usual walks")
-        told["walks"] = tuple(_walk(walk, file) for walk in walks)
-    own = _values(table, usual, ("seeds", "pooled", "control", "stages", "seed"))
+        seeds = len(own.get("seeds", usual.seeds))
+        told["walks"] = tuple(_walk(walk, file, seeds) for walk in walks)
     table.close()
     try:
         return replace(usual, **told, **own)
@@ -343,7 +344,7 @@ def read_plan(file: Path) -> Plan:
         raise InputError(f"{file}: {error}") from error
 
 
-def _walk(table: Table, file: Path) -> Walk:
+def _walk(table: Table, file: Path, seeds: int) -> Walk:
     try:
         direction = Direction(table.text("direction"))
         methods = tuple(map(Method, table.texts("methods"))) if table.has("methods") else ALL
@@ -352,8 +353,10 @@ def _walk(table: Table, file: Path) -> Walk:
     except ValueError as error:
         raise InputError(f"{file}: walk: {error}") from error
     robots = table.integer("robots")
+    if robots is not None and robots > seeds:
+        raise table.mistake("robots", f"{robots}, but seeds are {seeds}; name as many")
     table.close()
-    return Walk(direction, methods, Walk.robots if robots is None else robots)
+    return Walk(direction, methods, min(Walk.robots, seeds) if robots is None else robots)
 
 
 def _part(table: Table, usual: Any) -> Any:
