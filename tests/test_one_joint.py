@@ -117,5 +117,17 @@ def test_a_model_that_has_more_to_it_is_left_to_mujoco(field: str, value: float)
     assert OneJoint.of(batch) is None
 
 
+TENDON = """
+<mujoco>
+  <worldbody><body name="arm"><joint name="j"/><geom size="0.1" pos="0.1 0 0"/></body></worldbody>
+  <tendon><fixed limited="true" range="-1.4 2.4"><joint joint="j" coef="1"/></fixed></tendon>
+</mujoco>
+"""
+
+
+def test_a_tendon_that_is_slack_where_it_was_looked_at_is_left_to_mujoco() -> None:
+    assert OneJoint.of(mujoco.batch.Batch(mujoco.MjModel.from_xml_string(TENDON), N, 1)) is None
+
+
 def test_a_robot_of_more_joints_is_left_to_mujoco() -> None:
     assert OneJoint.of(mujoco.batch.Batch(LEG, N, 1)) is None

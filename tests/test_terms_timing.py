@@ -32,6 +32,16 @@ def test_late_commands_and_late_readings_are_shifts() -> None:
     assert read_late[5:] == pytest.approx(plain[:-5], abs=1e-12)
 
 
+def test_readings_older_than_the_recording_are_of_its_start_and_need_no_room() -> None:
+    """Of 1e9 s, as of somewhat more than there is: for all of them there would be no memory."""
+    time = np.arange(0, 0.4, 0.02)
+    run = recording(BENCH, time, np.where(time > 0.1, 0.4, 0.0))
+    rows = [{f"measurement_delay/time{AT}": old} for old in (0.1, 1e9)]
+    some, none = bench(run, *rows)
+    assert some.max() > 0.1
+    assert not none.any()
+
+
 def test_a_clock_that_goes_slow_meets_commands_early_and_ever_more_so() -> None:
     """A command told at t comes at t / (1 + share) by the encoders' clock."""
     time = np.arange(0, 10, 0.03)

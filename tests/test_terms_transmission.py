@@ -1,5 +1,7 @@
 """Gears against closed forms: play, give, rotors and stops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from terms import (
@@ -9,9 +11,12 @@ from terms import (
     KP,
     LEVER,
     STEP,
+    Array,
     G,
+    Row,
     bench,
     held,
+    play,
     ramp,
     sizes,
     steps,
@@ -20,6 +25,7 @@ from test_simulator import recording
 
 from pup.physics.terms import Place
 from pup.physics.terms.transmission import RELAXATION
+from pup.robot import RobotDescription
 
 
 @pytest.mark.parametrize("angle", [0.5, -0.5])
@@ -125,3 +131,34 @@ def test_what_a_stop_gives_back_of_the_speed_falls_with_its_loss(loss: float) ->
     rest = np.sqrt(1 - share**2)
     left = np.exp(-share / rest * np.arctan2(2 * share * rest, 2 * share**2 - 1))
     assert kept == pytest.approx(left, abs=0.03)
+
+
+def rolled(rows: list[Row], timestep: float) -> Array:
+    """The wrist of the SO-101, 6e-5 kg m² behind a rotor of 0.026, sent off, (n_rows, n_ticks)."""
+    arm = replace(RobotDescription.load("so101"), timestep=timestep)
+    wrist = arm.joint_names.index("Wrist_Roll")
+    time = np.arange(0, 0.6, 0.02)
+    target = np.zeros((len(time), len(arm.joints)))
+    target[5:, wrist] = 0.3
+    told = play(arm, recording(arm, time, target, np.zeros(len(arm.joints))), rows)
+    assert not told.diverged.any()
+    return np.asarray(told.position[:, :, wrist])
+
+
+@pytest.mark.parametrize("place", ["joint:Wrist_Roll", "robot"])
+def test_a_link_far_lighter_than_its_rotor_follows_it_whatever_gives(place: str) -> None:
+    """So it does at sub-steps that can follow how it swings."""
+    rows = [{f"joint_compliance/compliance@{place}": give} for give in (3e-4, 2e-3, 8e-3, 0.03)]
+    np.testing.assert_allclose(rolled(rows, 0.002), rolled(rows, 0.00025), atol=2e-4)
+
+
+def test_a_stop_gives_a_link_far_lighter_than_its_rotor_no_energy() -> None:
+    """It rattles between what gives and the stop, no further than its motor goes without one."""
+    there = Place("joint", "Wrist_Roll")
+    rows = [
+        {f"joint_compliance/compliance@{there}": give}
+        | sizes("joint_stop", there, stiffness=stiffness, angle=0.1)
+        for give in (4e-3, 8e-3)
+        for stiffness in (100.0, 1000.0)
+    ]
+    assert np.abs(rolled(rows, 0.002)).max() < 0.4

@@ -69,12 +69,13 @@ def apply_fields(
     each = len(parameters) // len(setups)
     for knob in robot.knobs:
         values = np.repeat([setup[knob.name] for setup in setups], each)
-        if (values == knob.default).all():
-            continue  # the MJCF is written at the knobs' defaults
+        turned = values != knob.default  # the MJCF is written at the knobs' defaults
+        if not turned.any():
+            continue
         for edit in knob.edits:
             field = writer.element(edit.field, edit.element)
-            column = ... if edit.index is None else (..., edit.index)
-            field[column] = edit.scale * values + edit.offset
+            rows = turned if edit.index is None else (turned, edit.index)
+            field[rows] = edit.scale * values[turned] + edit.offset
     viscous = np.tile(model.compiled.dof_damping[model.dofs], (len(parameters), 1))
     if armature is not None:
         writer.field("dof_armature")[:, model.dofs] = armature

@@ -156,9 +156,10 @@ class Run:
             self.torso = History(nsim, 4, self._age("tilt_delay"))
 
     def _age(self, hook: str) -> Array | None:
-        """How old readings are, sub-steps."""
+        """How old readings are, sub-steps; none is of long before the start, nor kept for it."""
         ages = longest(self.terms, hook)
-        return None if ages is None else ages / self.robot.timestep
+        most = len(self.group.running)
+        return None if ages is None else np.minimum(ages / self.robot.timestep, most)
 
     def _start(self, nsim: int) -> None:
         """Put the simulations where the recordings start."""

@@ -53,7 +53,7 @@ class OneJoint:
     def of(cls, batch: mujoco.batch.Batch) -> Self | None:
         """What moves a batch; None where its law of motion is not of this form."""
         model = batch.model
-        if model.nv != 1 or model.nq != 1:
+        if model.nv != 1 or model.nq != 1 or model.ntendon:  # tendons may pull in some poses only
             return None
         qpos, qvel, applied = (batch.bind(name) for name in ("qpos", "qvel", "qfrc_applied"))
         smooth, inertia, rows = (batch.bind(name) for name in ("qfrc_smooth", "M", "nefc"))

@@ -128,7 +128,7 @@ class Servos:
         """At which sub-steps the torque may be off somewhere, by whatever clock."""
         partly = (power != 1).any(axis=1)
         drift = sum(float(np.abs(term.pace() - 1).max()) for term in self.clocks)
-        off = np.ceil(drift * len(partly)) + 1 if drift else 0
+        off = min(np.ceil(drift * len(partly)) + 1, len(partly)) if drift else 0
         return np.asarray(maximum_filter1d(partly, 2 * int(off) + 1, mode="nearest"))
 
     def _on(self, step: int | Array, running: int, time: float | Array) -> Array | None:
