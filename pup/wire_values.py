@@ -123,6 +123,8 @@ def read(hint: Any, value: Any, place: str) -> Any:
         return tuple(read(get_args(hint)[0], entry, place) for entry in value)
     if get_origin(hint) is dict:
         hint = dict
+        if _holds_bytes(value):
+            raise WireError(f"{place} holds bytes; use numbers, texts, lists and maps of them")
     if is_dataclass(hint) and isinstance(hint, type):
         return _body(hint, value, place)
     if issubclass(hint, StrEnum):
@@ -136,6 +138,14 @@ def read(hint: Any, value: Any, place: str) -> Any:
     if type(value) is not hint:
         raise WireError(f"{place} is {type(value).__name__}, not {hint.__name__}")
     return value
+
+
+def _holds_bytes(value: Any) -> bool:
+    """Whether bytes stand in a map or list: what is passed on as JSON cannot tell them."""
+    entries = (
+        value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    )
+    return isinstance(value, bytes) or any(map(_holds_bytes, entries))
 
 
 def _hints(kind: type[Any]) -> dict[str, Any]:

@@ -45,7 +45,8 @@ class Service:
 
     @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
+        scheme = "https" if "CERTIFICATE" in self.more else "http"
+        return f"{scheme}://127.0.0.1:{self.port}"
 
     @property
     def link(self) -> str:

@@ -1,6 +1,7 @@
 """The gateway's pages in a real headless Chromium, as somebody who has come in sees them."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -76,6 +77,19 @@ def shot(page: Any, name: str) -> None:
     if SHOTS:
         Path(SHOTS).mkdir(parents=True, exist_ok=True)
         page.screenshot(path=f"{SHOTS}/{name}.png", full_page=True)
+
+
+def contrast(part: Any) -> float:
+    """Of a part's text and its own background, as WCAG has it."""
+    told = part.evaluate("p => [getComputedStyle(p).color, getComputedStyle(p).backgroundColor]")
+    darker, lighter = sorted(map(_luminance, told))
+    return (lighter + 0.05) / (darker + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    shares = [int(n) / 255 for n in re.findall(r"\d+", colour)[:3]]
+    red, green, blue = (s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def check(page: Any, path: str, size: str) -> None:

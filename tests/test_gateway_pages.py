@@ -108,8 +108,9 @@ def test_a_robot_that_falls_silent_is_shown_so(open_page, service):
 
 
 def test_names_are_text_and_nothing_else(open_page, service):
-    """What others say ends up on pages as text."""
-    keys = service.agent_keys("page-3")
+    """What others say ends up on pages as text, which fits on a phone however long it is."""
+    name = "page-3" + "x" * 57
+    keys = service.agent_keys(name)
 
     def walk(body):
         return fake_agent.Finished(
@@ -117,10 +118,10 @@ def test_names_are_text_and_nothing_else(open_page, service):
             body.attempt,
             body.fence,
             fake_agent.Outcome.ABORTED,
-            reason="<script>document.title='taken'</script><img src=x onerror=alert(1)>",
+            reason="<script>document.title='taken'</script><img src=x onerror=alert(1)>" + "x" * 90,
         )
 
-    asked = gateways.STUDY | {"name": "text", "agent": "page-3", "failures": 1}
+    asked = gateways.STUDY | {"name": "text", "agent": name, "failures": 1}
     with service.client() as http, fake_agent.FakeAgent(*keys, service.link, walk):
         http.post("/v1/studies", json=asked)
         service.wait_for("text", "paused")
@@ -130,6 +131,60 @@ def test_names_are_text_and_nothing_else(open_page, service):
         assert page.title() == "pup: text" and page.locator("img").count() == 0
         page.get_by_role("button", name="Retry").wait_for()
         pages.shot(page, "study_paused")
+        phone = open_page(viewport=pages.PHONE, has_touch=True, is_mobile=True)
+        for path in ("/studies", "/studies/text", "/agents"):
+            pages.check(phone, path, "phone")
+
+
+def test_a_change_of_the_page_takes_no_button_from_under_a_finger(open_page, service):
+    """Nor the focus: an agent's card changes with each of its heartbeats."""
+    keys = service.agent_keys("page-5")
+    with fake_agent.FakeAgent(*keys, service.link, lambda _: None) as agent:
+        page = open_page()
+        page.goto("/agents")
+        button = page.get_by_role("button", name="STOP page-5")
+        button.focus()
+        button.hover()
+        page.mouse.down()
+        for _ in range(2):
+            page.wait_for_event("response", lambda r: r.url.endswith("/agents/live"))
+        assert button.evaluate("button => button === document.activeElement")
+        with page.expect_response("**/page-5:stop"):
+            page.mouse.up()
+        page.get_by_text("Was stopped (operator").first.wait_for()
+        assert agent.state == "stopped"
+
+
+def test_a_stream_that_a_proxy_refused_is_asked_for_again(open_page):
+    """As after the 502 of one whose gateway is being started: a browser gives such a stream up."""
+    page = open_page()
+    page.route("**/events", lambda route: route.fulfill(status=502))
+    page.goto("/agents")
+    page.get_by_text("does not answer").first.wait_for()
+    page.unroute("**/events")
+    page.locator("#away").wait_for(state="hidden")
+
+
+def test_a_stream_that_begins_anew_brings_what_is_new(open_page):
+    """Another gateway counts from 0: the number that it begins with tells nothing."""
+    page = open_page()
+    body = "retry: 50\ndata: 7\n\n"
+    page.route(
+        "**/events", lambda route: route.fulfill(body=body, content_type="text/event-stream")
+    )
+    page.goto("/agents", wait_until="commit")
+    for _ in range(3):
+        page.wait_for_event("response", lambda r: r.url.endswith("/agents/live"))
+
+
+def test_the_gate_can_be_read_in_the_dark(open_page, service):
+    with service.client() as http:
+        http.post("/v1/studies", json=gateways.STUDY | {"name": "dark", "gate": "operator"})
+    page = open_page(color_scheme="dark")
+    page.goto("/studies/dark")
+    page.get_by_role("button", name="Release trial 1").wait_for()
+    for kind in ("go", "plain"):
+        assert pages.contrast(page.locator(f"button.{kind}")) >= 4.5
 
 
 def test_a_gateway_that_is_away_is_told_and_comes_back(open_page, service):

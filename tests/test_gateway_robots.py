@@ -16,7 +16,9 @@ from test_gateway import until
 from test_gateway_link import dealer
 
 from pup.wire import AgentState, Assign, Heartbeat, Hello, Message, Policy, Stop, decode, encode
+from services.gateway.agents import AgentView
 from services.gateway.keys import KeyRing
+from services.gateway.metrics import Metrics
 
 STUDY = gateways.STUDY | {"trials": 2, "initial": 2, "repeats": 0}
 
@@ -90,6 +92,15 @@ def test_a_key_that_is_replaced_in_its_place_is_another_robot(service, tmp_path)
         assert not any(isinstance(body, Stop | Assign) for body in _drain(first))
         first.close()
         second.close()
+
+
+def test_metrics_tell_how_long_a_robot_was_not_heard_whose_key_was_revoked():
+    metrics, revoked = Metrics(), AgentView("gone", heard=time.monotonic() - 100)
+    metrics.agent(revoked)
+    metrics.agent(AgentView("never"))
+    age = metrics.registry.get_sample_value
+    assert age("pup_agent_heartbeat_age_seconds", {"agent": "gone"}) >= 100
+    assert age("pup_agent_heartbeat_age_seconds", {"agent": "never"}) is None
 
 
 def _hello(version):

@@ -165,6 +165,12 @@ def test_attempts_are_made_until_there_are_no_more_retries():
     )
 
 
+def test_a_clock_that_is_put_back_keeps_no_job_waiting():
+    job = reconciled(NEW.known(), Seen(Status.UNKNOWN), None, True, 10_000.0)
+    assert job.waits(10_002.0) == 3.0
+    assert job.waits(10_005.0) == job.waits(9000.0) == 0.0
+
+
 def test_what_was_lost_after_long_work_is_tried_again_and_again():
     job, lost, now = NEW, Seen(Status.UNKNOWN), 10.0
     for lasted in (700.0, 700.0, 700.0, 30.0):

@@ -165,6 +165,10 @@ REFUSED = {
         envelope(type="Cancel", body={"trial": "t", "attempt": -1, "fence": 0}),
         "Cancel.attempt is -1, below 0",
     ),
+    "bytes in what is told as JSON": (
+        envelope(type="Heartbeat", body={"health": {"hot": [{"servo": b"A"}]}}),
+        "Heartbeat.health holds bytes",
+    ),
     "a count that is true": (
         envelope(type="Cancel", body={"trial": "t", "attempt": True, "fence": 0}),
         "Cancel.attempt is bool, not int",

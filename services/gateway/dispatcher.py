@@ -139,7 +139,7 @@ class Dispatcher:
         One that found no room goes behind the others, who may find some.
         """
         now = time.time()
-        queued = [j for j in self.jobs.values() if j.state is JobState.QUEUED and j.due <= now]
+        queued = [j for j in self.jobs.values() if j.state is JobState.QUEUED and not j.waits(now)]
         queued.sort(key=lambda job: job.roomless)
         return {job.id for job in queued[: max(0, self.at_once - self._under_way())]}
 
@@ -244,7 +244,7 @@ class Dispatcher:
             return ""
         if self.trouble:
             return self.trouble
-        if job.state is JobState.QUEUED and (left := job.due - time.time()) > 0:
+        if job.state is JobState.QUEUED and (left := job.waits(time.time())):
             return f"its next attempt, in {left:.0f} s"
         if job.state is JobState.QUEUED and self._under_way() >= self.at_once:
             return "other jobs"

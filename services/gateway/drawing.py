@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from html import escape
+from itertools import accumulate
 
 from pup.transfer.study import Study
 from pup.transfer.trial import Purpose, Trial, TrialState
@@ -18,8 +19,9 @@ class Axes:
     def __init__(self, x: tuple[float, float], y: tuple[float, float], width: int) -> None:
         self.x, self.width = x, width
         low, high = y
-        room = max(high - low, 1e-3) * 0.06
-        self.y = (low - room, high + room)
+        least = max(1e-3, 0.01 * max(abs(low), abs(high)))  # whose numbers can be told apart
+        middle, half = (low + high) / 2, 0.56 * max(high - low, least)
+        self.y = (middle - half, middle + half)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Place of a point, in pixels."""
@@ -75,14 +77,17 @@ def progress(study: Study) -> str:
     if not points:
         return ""
     last = max(2, len(study.trials))
-    axes = Axes((0.5, last + 0.5), (0.0, max(d for _, d in points)), WIDTH)
+    walks = [0.0, *(d for _, d in points)]  # some went backwards
+    axes = Axes((0.5, last + 0.5), (min(walks), max(walks)), WIDTH)
     step = max(1, last // 10)
     drawn = axes.frame("trial", "distance, m", range(1, last + 1, step))
     searched = [(t, d) for t, d in points if t.purpose in (Purpose.INITIAL, Purpose.SEARCH)]
     numbers, farthest = [], []
-    for i, (trial, _) in enumerate(searched):
-        numbers += [trial.number, searched[i + 1][0].number if i + 1 < len(searched) else last]
-        farthest += [max(d for _, d in searched[: i + 1])] * 2
+    ends = [t.number for t, _ in searched[1:]] + [last]
+    best = accumulate((d for _, d in searched), max)
+    for (trial, _), end, distance in zip(searched, ends, best, strict=False):
+        numbers += [trial.number, end]
+        farthest += [distance] * 2
     drawn.append(axes.line(numbers, farthest, "best"))
     drawn += [_mark(axes, t, d) for t, d in points]
     return svg(WIDTH, f"distances of {len(points)} walks", drawn)

@@ -145,6 +145,11 @@ class Job:
             return 0.0
         return self.last.ended + min(BACKOFF * 2 ** (self.failures - 1), LONGEST)
 
+    def waits(self, now: float) -> float:
+        """Until a queued job may be attempted, s; no longer where the clock was put back since."""
+        left = self.due - now
+        return left if 0 < left <= LONGEST else 0.0
+
     @property
     def roomless(self) -> float:
         """When its last attempt ended without having found room, s; 0 where it did."""

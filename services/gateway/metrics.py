@@ -1,6 +1,6 @@
 """What Prometheus reads."""
 
-import time
+import math
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
@@ -61,8 +61,8 @@ class Metrics:
 
     def agent(self, view: AgentView) -> None:
         """Bring the gauges of an agent up to date."""
-        if view.hello is not None:
-            self.silence.labels(view.name).set(time.monotonic() - view.heard)
+        if math.isfinite(view.silent):
+            self.silence.labels(view.name).set(view.silent)
         numbers = [(k, v) for k, v in view.health.items() if isinstance(v, int | float)]
         for name, value in numbers[:HEALTH_LIMIT]:
             self.health.labels(view.name, name).set(value)

@@ -83,8 +83,13 @@ def serve(config: Config) -> dict[str, Any]:
 def _check_certificate(config: Config) -> None:
     if not config.certificate:
         return
+
+    def phrase() -> str:  # asked at a terminal otherwise, and where there is none, for nothing
+        raise InputError(f"key {config.key}: is encrypted; give it without a pass phrase")
+
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(config.certificate, config.key)
+        context.load_cert_chain(config.certificate, config.key, phrase)
     except OSError as error:  # of a file, or of what stands in it
         why = error.strerror or error
         raise InputError(f"certificate {config.certificate}, key {config.key}: {why}") from error
