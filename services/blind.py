@@ -1,12 +1,12 @@
 """The blind jobs: make a sealed set of concealed cases, diagnose it, and score the verdicts."""
 
 import argparse
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pup.blind.make import Order, make_set
+from pup.blind.make import Order, make_set, parts_of
 from pup.blind.seal import read_set
 from pup.errors import InputError
 from pup.files import write_atomic, write_json
@@ -34,16 +34,38 @@ def make(options: argparse.Namespace) -> dict[str, Any]:
             for _ in orders:
                 yield pool.settled()
 
-    with counted("blind make") as tell:
+    wanted = _counts("--robot", options.robot), _counts("--nulls", options.nulls)
+    parts = parts_of(options.key)
+    with _concealed(parts), held(parts), counted("blind make") as tell:
         return make_set(
-            dict(options.robot),
-            dict(options.nulls),
+            *wanted,
             options.seed,
             options.out,
             options.key,
             lambda id, done, total: tell(done, total),
             each,
         )
+
+
+def _counts(option: str, given: Sequence[tuple[str, int]]) -> dict[str, int]:
+    """Cases by robot, each robot once."""
+    counts = dict(given)
+    if len(counts) < len(given):
+        raise InputError(f"{option}: a robot is named twice; name it once, with all of its cases")
+    return counts
+
+
+@contextmanager
+def _concealed(folder: Path) -> Iterator[None]:
+    """A folder that its owner alone can read; gone again if nothing came of it."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # some are not empty
+            for path in made:
+                path.rmdir()
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
@@ -77,6 +99,7 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
     table = options.out.with_suffix(".md")
     if options.out.is_dir() or options.out == table:
         raise InputError(f"--out {options.out}: needs a file for JSON; the table goes to *.md")
+    _spare(options, options.out, table)
     commitment, journal = read_set(options.set), read_journal(options.diagnoses)
     if journal and any(journal["set"].get(name) != commitment.get(name) for name in SAME_SET):
         raise InputError(f"{options.diagnoses / JOURNAL}: tells of a run over another set")
@@ -90,6 +113,14 @@ def score(options: argparse.Namespace) -> dict[str, Any]:
     page = markdown(scores)
     write_atomic(table, page)
     return {**scores, "table": page}
+
+
+def _spare(options: argparse.Namespace, *written: Path) -> None:
+    """Refuse to write scores in the place of what they are made from."""
+    inputs = (options.key, options.diagnoses / JOURNAL)
+    for path in map(Path.resolve, written):
+        if path in map(Path.resolve, inputs) or path.is_relative_to(options.set.resolve()):
+            raise InputError(f"{path}: is of what is scored; use another --out")
 
 
 ACTIONS = {"make": make, "run": run, "score": score}

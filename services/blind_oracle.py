@@ -7,6 +7,7 @@ import numpy as np
 
 from pup.blind.score import Replayed
 from pup.diagnosis.residuals import LOST, Measured
+from pup.errors import InputError
 from pup.files import read_json
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import ParameterSpace, robot_space
@@ -28,12 +29,16 @@ def replayed(diagnosed: Path, tests: Sequence[Recording]) -> Replayed | None:
     Returns:
       The errors; None where the document does not tell the nominal model.
     """
-    document = read_json(diagnosed / DIAGNOSIS)
-    if not isinstance(document.get("nominal"), dict):
+    nominal = read_json(diagnosed / DIAGNOSIS).get("nominal")
+    if not isinstance(nominal, dict) or not all(
+        isinstance(v, int | float) for v in nominal.values()
+    ):
         return None
-    robot = RobotDescription.load(document["robot"])
+    robot = RobotDescription.load(tests[0].robot)
     corrected = RobotDescription.load(diagnosed / CORRECTED)
-    refitted = robot_space(robot, LAW).at(document["nominal"])
+    if corrected.joint_names != robot.joint_names:
+        raise InputError(f"{diagnosed / CORRECTED}: has other joints than robot {robot.name!r}")
+    refitted = robot_space(robot, LAW).at(nominal)
     return Replayed(
         nominal=_error(robot, refitted, tests),
         corrected=_error(corrected, robot_space(corrected, LAW), tests),

@@ -24,6 +24,7 @@ from pup.errors import InputError
 from pup.files import read_json, write_json
 from pup.recording import KEY, load_recordings
 from pup.robot import RobotDescription
+from services.held import held
 
 CASES, NULL_CASES = {"servo_bench": 1}, {"servo_bench": 1, "darwin_leg": 1}
 SEED = "open sesame, and shut again"
@@ -147,6 +148,32 @@ def test_the_same_seed_makes_the_same_bytes_and_a_stopped_set_goes_on(tmp_path: 
     assert oct((tmp_path / "b" / "key").stat().st_mode & 0o777) == "0o600"
 
 
+def test_files_of_a_set_are_begun_anew_when_all_are_made(tmp_path: Path) -> None:
+    """When a file was begun, which nobody can set, would tell how long a case took."""
+    begun: dict[str, int] = {}
+
+    def report(id: str, done: int, total: int) -> None:
+        for path in (tmp_path / "set" / f"case_{id}", *(tmp_path / "set").rglob("*.parquet")):
+            begun[path.relative_to(tmp_path).as_posix()] = path.stat().st_ino
+
+    make_set({}, NULLS_ALONE, LONG, tmp_path / "set", tmp_path / "key", report)
+    assert len(begun) > 8
+    assert all((tmp_path / name).stat().st_ino != inode for name, inode in begun.items())
+    assert not list((tmp_path / "set").glob(".*"))
+
+
+def test_a_set_that_is_being_made_is_nobody_elses(tmp_path: Path) -> None:
+    order = ("--nulls", "servo_bench=2", "--seed", LONG, "--local")
+    where = ("--out", tmp_path / "set", "--key", tmp_path / "key")
+    with held(stopped(tmp_path)):
+        before = files(tmp_path)
+        done = pup("blind", "make", *order, *where)
+        assert done.code == 1 and "another process works in this folder" in done.err
+        assert files(tmp_path) == before
+    assert pup("blind", "make", *order, *where).code == 0
+    assert not (tmp_path / "key.parts").exists()
+
+
 def stopped(folder: Path) -> Path:
     """What a set leaves that is stopped after its first case: the folder of its parts."""
 
@@ -229,13 +256,14 @@ def test_a_null_without_noise_is_the_nominal_model(bench: RobotDescription) -> N
         ((), "no case asked for"),
         (("--robot", "servo_bench"), "NAME=COUNT"),
         (("--nulls", "servo_bench=-1"), "NAME=COUNT"),
+        (("--nulls", "servo_bench=1", "servo_bench=2"), "--nulls: a robot is named twice"),
     ],
 )
 def test_a_wrong_order_is_refused(options: tuple[str, ...], told: str, tmp_path: Path) -> None:
     where = ("--seed", LONG, "--out", tmp_path / "set", "--key", tmp_path / "key")
     done = pup("blind", "make", *options, *where)
     assert done.code == 2 and told in done.err
-    assert not files(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_key_inside_the_set_is_refused(tmp_path: Path) -> None:

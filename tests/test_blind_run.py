@@ -15,9 +15,13 @@ from commandline import Outcome, files, pup, pup_process
 from diagnosis_cases import recordings
 from jobs import Job
 
+from pup.errors import InputError
 from pup.files import read_json, write_json
+from pup.recording import load_recordings
+from pup.robot import RobotDescription
 from services import blind_run
 from services.blind_journal import Journal
+from services.blind_oracle import replayed
 from services.blind_run import Order, diagnose_case, orders, run_cases
 from services.failures import FailedError
 from services.places import OneByOne
@@ -129,6 +133,25 @@ def test_scores_have_the_oracle_ratio_and_both_commits(diagnosed: Path, tmp_path
     table = (tmp_path / "scores.md").read_text()
     assert "to engine not named; diagnosed by " in table
     assert str(scores["engine"]["git_sha"] or "without a commit") in table
+
+
+def test_a_model_that_cannot_be_replayed_is_none_or_refused(
+    diagnosed: Path, tmp_path: Path
+) -> None:
+    tests = load_recordings([diagnosed / "set" / "case_0f" / "test"])
+    case = shutil.copytree(diagnosed / "out" / "case_0f", tmp_path / "case")
+    document = read_json(case / "diagnosis.json")
+    whole = replayed(case, tests)
+    del document["robot"]
+    write_json(case / "diagnosis.json", document)
+    assert replayed(case, tests) == whole
+    write_json(case / "diagnosis.json", document | {"nominal": {"kp/servo": "stiff"}})
+    assert replayed(case, tests) is None
+    write_json(case / "diagnosis.json", document)
+    shutil.rmtree(case / "corrected")
+    shutil.copytree(RobotDescription.load("darwin_leg").model_path.parent, case / "corrected")
+    with pytest.raises(InputError, match="corrected: has other joints than robot 'servo_bench'"):
+        replayed(case, tests)
 
 
 def test_what_is_no_proof_is_warned_of(diagnosed: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pup.blind.absorb import CLEAR, Visibility, labelled, shifted, view
+from pup.blind.claims import VERDICTS
 from pup.blind.reference import Reference, readings
 from pup.blind.refit import Refit
 from pup.blind.sensors import Noise
@@ -22,7 +23,6 @@ from pup.robot import RobotDescription
 SAME = 0.1  # relative, to which the truth must be what the key tells of it before a refit
 EDGE = 1e-9  # relative, by which a parameter may be past its bounds
 VIEWS = ("effect_seen", "all_seen")
-VERDICTS = ("mismatch", "none", "undetermined")
 
 Lower = dict[str, dict[str, float]]
 """By view, SNR and absorbed share: what the key tells and what counts instead."""

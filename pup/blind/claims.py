@@ -1,6 +1,7 @@
 """What a diagnosis claims: the names it gives, the first of them first."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,8 @@ from pup.blind.catalogue import CLASS_OF
 
 SHARP = 0.8  # share of a finding's probability from which a name counts as a sharp claim
 UNKNOWN = "unknown"  # what a finding outside the list is called
+VERDICTS = ("mismatch", "none", "undetermined")
+ROUNDING = 1e-9  # by which a probability may be outside of 0 to 1
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,38 @@ class Named:
     probability: float
     finding: int
     head: bool
+
+
+def check(document: Mapping[str, Any], robot: str) -> None:
+    """Refuse a diagnosis of which a word or a number would be counted in silence as something else.
+
+    Args:
+      document: the diagnosis.
+      robot: of the case.
+
+    Raises:
+      ValueError: the verdict is none of the contract's, it is of another robot, a number in a
+        finding is none, or a probability is no share.
+    """
+    if document["verdict"] not in VERDICTS:
+        raise ValueError(f"verdict {document['verdict']!r} is none of {', '.join(VERDICTS)}")
+    if document.get("robot", robot) != robot:
+        raise ValueError(f"robot {document['robot']!r}, in a case of {robot!r}")
+    findings = document.get("findings", [])
+    if not all(math.isfinite(number) for number in _numbers(findings)):
+        raise ValueError("a number in a finding is not finite")
+    for one in (e for finding in findings for e in (finding, *finding.get("equivalents", []))):
+        if not -ROUNDING <= float(one["probability"]) <= 1.0 + ROUNDING:
+            raise ValueError(f"probability {one['probability']} is not between 0 and 1")
+
+
+def _numbers(value: object) -> Iterator[float]:
+    """All numbers in a JSON value."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            yield from _numbers(part)
 
 
 def ranking(findings: Sequence[Mapping[str, Any]]) -> list[Named]:

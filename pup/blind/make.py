@@ -104,7 +104,7 @@ def make_set(
         made.
     """
     # Absolute, as a worker's working directory is another.
-    orders = _orders(cases, nulls, seed, out.absolute(), _parts(key).absolute())
+    orders = _orders(cases, nulls, seed, out.absolute(), parts_of(key).absolute())
     if len(seed) < SHORTEST:
         raise InputError(f"the seed tells the key; use one of {SHORTEST} characters or more")
     if key.resolve().is_relative_to(out.resolve()):
@@ -127,10 +127,27 @@ def make_set(
     salt = _sha(f"salt of {seed}")
     write_key(key, {"schema": 1, "salt": salt, "generator": made_with, "cases": truths})
     commitment = commit(out, key)
-    for path in (*out.rglob("*"), out):
-        os.utime(path, (SEALED, SEALED))  # how long a case took would tell of what kind it is
-    shutil.rmtree(_parts(key))
+    _date(out, orders)
+    for order in orders:
+        order.part.unlink()  # before what tells that the set is to be gone on with
+    shutil.rmtree(parts_of(key))
     return commitment
+
+
+def _date(out: Path, orders: Sequence[Order]) -> None:
+    """Give all files of a set one date: how long a case took would tell of what kind it is.
+
+    A file system remembers when a file was begun too, which nobody can set: the cases' are begun
+    anew here, one case after the other.
+    """
+    for order in orders:
+        anew = out / f".{order.folder.name}"
+        shutil.rmtree(anew, ignore_errors=True)  # what a call that was killed left of it
+        shutil.copytree(order.folder, anew)
+        shutil.rmtree(order.folder)
+        os.replace(anew, order.folder)
+    for path in (*out.rglob("*"), out):
+        os.utime(path, (SEALED, SEALED))
 
 
 def make_one(order: Order) -> str:
@@ -179,7 +196,7 @@ def _orders(
 
 def _claim(out: Path, key: Path, what: Mapping[str, Any]) -> None:
     """Start a set, or go on with the same one."""
-    plan = _parts(key) / "set.json"
+    plan = parts_of(key) / "set.json"
     if plan.exists():
         told = read_json(plan)
         if told != what:
@@ -195,7 +212,7 @@ def _claim(out: Path, key: Path, what: Mapping[str, Any]) -> None:
     write_key(plan, what)
 
 
-def _parts(key: Path) -> Path:
+def parts_of(key: Path) -> Path:
     """Where the truths of the cases made so far stand."""
     return key.with_name(f"{key.name}.parts")
 

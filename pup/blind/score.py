@@ -1,6 +1,7 @@
 """Scoring verdicts against a revealed key."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 
 from pup.blind.absorb import MATERIAL
 from pup.blind.bound import Lower, bounded
+from pup.blind.claims import check
 from pup.blind.judge import Judged, judge
 from pup.blind.seal import COMMITMENT, verify
 from pup.blind.statistics import calibration, mean, share
@@ -81,7 +83,7 @@ def score_set(
     judged, bounds = [], []
     for truth in truths:
         name, robot = f"case_{truth['id']}", robots[truth["robot"]]
-        document = _diagnosis(diagnoses / name / DIAGNOSIS) or {}
+        document = _diagnosis(diagnoses / name / DIAGNOSIS, robot) or {}
         entry, lower = bounded(truth, folder / name, robot, document.get("nominal"))
         bounds.append((truth, entry, lower))
         judged.append(_judged(entry, folder / name, diagnoses / name, robot, replay))
@@ -127,15 +129,11 @@ def _judged(
     replay: Replay | None,
 ) -> Judged:
     """Judge the diagnosis in a folder."""
-    document = _diagnosis(diagnosed / DIAGNOSIS)
+    document = _diagnosis(diagnosed / DIAGNOSIS, robot)
     null = truth["stratum"].startswith("null:")
     oracle = None if replay is None or null else _oracle(truth, case / "test", diagnosed, replay)
-    try:
+    with _by_contract(diagnosed / DIAGNOSIS):
         return judge(truth, document, robot, oracle, _repeats(case / "recordings"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{diagnosed / DIAGNOSIS}: does not follow the contract ({error!r})"
-        ) from error
 
 
 def _refits(
@@ -290,13 +288,24 @@ def _failure(case: Judged) -> dict[str, Any]:
     }
 
 
-def _diagnosis(path: Path) -> dict[str, Any] | None:
-    """A diagnosis; None where there is none."""
+@contextmanager
+def _by_contract(path: Path) -> Iterator[None]:
+    """Tell of a diagnosis that is not built as the contract has it."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: does not follow the contract ({error!r})") from error
+
+
+def _diagnosis(path: Path, robot: RobotDescription) -> dict[str, Any] | None:
+    """A diagnosis of a robot; None where there is none."""
     if not path.is_file():
         return None
     document = read_json(path)
     if not isinstance(document, dict) or document.get("schema") != 1:
         raise InputError(f"{path}: not a diagnosis (schema 1)")
+    with _by_contract(path):
+        check(document, robot.name)
     return document
 
 
