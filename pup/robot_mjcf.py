@@ -42,8 +42,9 @@ def read_mjcf(path: Path) -> MjcfNames:
     """Read the names of an MJCF model and of the files it includes.
 
     Raises:
-      InputError: not XML, too large, a document type, a file outside the model's folder, a joint
-        without a name, of a kind other than hinge or slide, or a second free joint.
+      InputError: not XML, too large, a document type, a file outside the model's folder, a model
+        that is attached, a joint without a name, of a kind other than hinge or slide, or a second
+        free joint.
     """
     texts: list[str] = []
     root = _parse(path, texts)
@@ -150,6 +151,11 @@ def _assets(root: ElementTree.Element, model: Path) -> Iterator[Path]:
     for compiler in root.iter("compiler"):
         folders.update({key: compiler.get(key, folders[key]) for key in FOLDER_KEYS})
     for element in root.iter():
+        if element.tag == "model":  # of an <attach>; its own files could lie anywhere
+            raise InputError(
+                f"{model}: attaches {element.get('file')!r}, which is not read; `pup describe` "
+                "writes both as one file"
+            )
         for attribute, file in element.items():
             if attribute.startswith("file"):
                 for folder in ("", *folders.values()):

@@ -9,8 +9,9 @@ from pup.physics.parameters import robot_space
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.robot import RobotDescription
 from pup.sysid.accuracy import JointUnits, accuracy
+from pup.sysid.figures import drawing_style
 from pup.sysid.loss import LOST_POSITION, ReplayLoss
-from pup.sysid.overlays import Overlays, by_motion, write_overlays
+from pup.sysid.overlays import Overlays, Panel, _small, by_motion, write_overlays
 from pup.sysid.report import write_report
 from pup.sysid.result import Bounds
 from tests.reports import (
@@ -102,6 +103,28 @@ def test_the_only_joint_is_shown_in_several_recordings() -> None:
     panels = overlays.joint_panels(range(4), "x")
     shown = [(panel.rank, panel.recording.id) for panel in panels]
     assert shown == [("worst", "c"), ("median", "d"), ("best", "b")]
+
+
+@pytest.mark.parametrize(
+    ("unit", "end", "low", "high"),
+    [
+        ("rad", 12.1, -1.5708, -1.5608),  # a joint that hardly moves, and a chirp's end
+        ("m", 17.6, -0.005, 0.005),
+        ("rad or m", 1.02, -0.1, 0.11),
+        ("rad", 100.4, -3.1, 3.1),
+    ],
+)
+def test_what_stands_at_a_panels_axes_is_inside_it(
+    unit: str, end: float, low: float, high: float
+) -> None:
+    time, values = np.linspace(0, end, 50), np.linspace(low, high, 50)
+    panel = Panel("", RECORDINGS[0], "knee", time, values, values, {"PD": values}, {"PD": 0.0})
+    with drawing_style():
+        figure = _small(panel, ["PD"], max(high - low, 0.01), unit)
+        figure.canvas.draw()
+        box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+    assert box.x0 >= 0 and box.x1 <= width
+    assert box.y0 >= 0 and box.y1 <= height
 
 
 def test_recordings_are_grouped_by_motion_and_step() -> None:

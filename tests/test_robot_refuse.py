@@ -134,12 +134,43 @@ WRONG_MODEL = [
         '<compiler meshdir=".."/><asset><mesh name="m" file="a.stl"/></asset><worldbody>',
         "'../a.stl' lies outside the robot's folder",
     ),
+    (
+        "<worldbody>",
+        '<asset><model name="m" file="arm.xml"/></asset><worldbody>',
+        "attaches 'arm.xml', which is not read; `pup describe`",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("old", "new", "words"), WRONG_MODEL, ids=[w[2][:40] for w in WRONG_MODEL])
 def test_a_wrong_model_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     refused(robot_folder(tmp_path, model=swap(old, new)(MODEL)), words)
+
+
+RIGHT = '<body name="right"><joint name="r"/>'
+LEGS = '<replicate count="2"><body><joint name="r"/><geom size="0.1"/></body></replicate>'
+CLOTH = '<flexcomp name="f" type="grid" count="2 2 1" dim="2" spacing="1 1 1" mass="1"/>'
+TIP = '<body name="tip"><inertial mass="{}" pos="0 {} 0" diaginertia="1 1 1"/></body>'
+MADE_OTHERWISE = [
+    (RIGHT, '<body name="right">' + LEGS, "robot.toml, as MuJoCo reads them: r, r0, r1;"),
+    ("<worldbody>", "<worldbody>" + CLOTH, "as MuJoCo reads them: one without a name;"),
+    (RIGHT, RIGHT + TIP.format("nan", 0), "body 'tip' has a mass, an inertia or a place that"),
+    (RIGHT, RIGHT + TIP.format(1, "inf"), "a place that is no finite number"),
+]
+
+
+@pytest.mark.filterwarnings("ignore:flex")
+@pytest.mark.parametrize(
+    ("old", "new", "words"), MADE_OTHERWISE, ids=[w[2] for w in MADE_OTHERWISE]
+)
+def test_what_mujoco_makes_otherwise_than_the_files_say_is_refused(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    """Joints that no servo would drive, and bodies with which every replay would break down."""
+    folder = robot_folder(tmp_path, model=swap(old, new)(MODEL))
+    with pytest.raises(InputError, match=re.escape(words)) as error:
+        compile_model(RobotDescription.load(folder), "ground")
+    assert str(folder) in str(error.value) and "\n" not in str(error.value)
 
 
 def test_the_network_needs_27_weights_and_nn_pd_a_network(tmp_path: Path) -> None:

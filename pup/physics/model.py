@@ -50,6 +50,7 @@ class Model:
     contacts: tuple[tuple[int, int], ...]
 
 
+DRIVEN = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 BEYOND, MARGIN = 2.0, 0.5
 """Limits of a hinge in robot.toml may be so many times the larger end of its range in the MJCF, and
 so much more, rad; degrees beside radians are further apart."""
@@ -110,6 +111,8 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
             f"robot {robot.name!r} has a fixed base and cannot be on the ground; "
             "the recording's support should be 'bench'"
         )
+    _check_joints(robot, compiled)
+    _check_numbers(robot, compiled)
     _check_limits(robot, compiled)
     ids = [compiled.joint(name).id for name in robot.joint_names]
     model = Model(
@@ -124,6 +127,27 @@ def compile_model(robot: RobotDescription, support: str, extend: Extension | Non
         _check_floor(robot, compiled)
         _check_mount(robot, model)
     return model
+
+
+def _check_joints(robot: RobotDescription, model: mujoco.MjModel) -> None:
+    """Refuse hinges and slides that the file's text does not show: nobody would drive them."""
+    made = {model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] in DRIVEN}
+    if odd := sorted(made.symmetric_difference(robot.joint_names)):
+        raise InputError(
+            f"{robot.model_path}: no hinge or slide of both this file and robot.toml, as MuJoCo "
+            f"reads them: {', '.join(name or 'one without a name' for name in odd)}; write out the "
+            "joints that <replicate>, <flexcomp> or the defaults make"
+        )
+
+
+def _check_numbers(robot: RobotDescription, model: mujoco.MjModel) -> None:
+    """Refuse bodies that MuJoCo takes with numbers that no simulation survives."""
+    told = [model.body_mass[:, None], model.body_inertia, model.body_pos, model.body_ipos]
+    for body in np.flatnonzero(~np.isfinite(np.hstack(told)).all(axis=1)):
+        raise InputError(
+            f"{robot.model_path}: body {model.body(body).name!r} has a mass, an inertia or a place "
+            "that is no finite number; correct it"
+        )
 
 
 def _check_limits(robot: RobotDescription, model: mujoco.MjModel) -> None:

@@ -25,6 +25,8 @@ ANGLES = ("torso roll", "torso pitch")
 DOTTED = 120
 """Up to this many samples a measurement is drawn with a dot at each."""
 LINE_WIDTH = 1.3
+ROUND = (1, 2, 5, 10)
+"""Steps between the numbers at an axis: others have a digit more than there is room for."""
 MOVED = 0.1
 """Joints commanded over at least this share of the widest command count as moved."""
 
@@ -190,15 +192,8 @@ class Overlays:
         """Draw panels side by side: the same height of the axis stands for the same angle."""
         height = max(_span(panel)[1] for panel in panels)
         for panel in panels:
-            figure = new_figure(3.0, 2.0, fixed=True)
-            axes = figure.add_axes((0.2, 0.21, 0.78, 0.76))  # fixed, so that panels line up
-            draw_panel(axes, panel, list(self.replays))
-            middle = _span(panel)[0]
-            axes.set_ylim(middle - 0.55 * height, middle + 0.55 * height)
-            axes.set_xlabel("time [s]")
             unit = "rad" if panel.signal in ANGLES else self.units.position
-            axes.set_ylabel(f"{'position' if unit != 'rad' else 'angle'} [{unit}]")
-            yield panel, as_svg(figure)
+            yield panel, as_svg(_small(panel, list(self.replays), height, unit))
 
 
 def _worst_median_best(error: Array) -> list[tuple[str, int]]:
@@ -224,6 +219,18 @@ def _span(panel: Panel) -> tuple[float, float]:
     return float(values.max() + values.min()) / 2, max(float(np.ptp(values)), 0.01)
 
 
+def _small(panel: Panel, labels: Sequence[str], height: float, unit: str) -> Any:
+    """The figure of a panel; its axes have a fixed place, so that panels line up."""
+    figure = new_figure(3.0, 2.0, fixed=True)
+    axes = figure.add_axes((0.255, 0.21, 0.7, 0.76))
+    draw_panel(axes, panel, labels)
+    middle = _span(panel)[0]
+    axes.set_ylim(middle - 0.55 * height, middle + 0.55 * height)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(f"{'position' if unit != 'rad' else 'angle'} [{unit}]")
+    return figure
+
+
 def draw_panel(axes: Any, panel: Panel, labels: Sequence[str]) -> None:
     """Draw command, measurement and simulations into axes."""
     if panel.target is not None:
@@ -240,7 +247,7 @@ def draw_panel(axes: Any, panel: Panel, labels: Sequence[str]) -> None:
     for label, values in panel.simulated.items():
         colour, dash = line_style(label, labels)
         axes.plot(panel.time, values, color=colour, linestyle=dash, linewidth=LINE_WIDTH)
-    axes.locator_params(axis="y", nbins=5)
+    axes.locator_params(axis="y", nbins=5, steps=ROUND)
     axes.grid()
 
 
