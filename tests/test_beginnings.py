@@ -1,11 +1,13 @@
 """Fits that begin where the beginnings of recordings lead, and slopes across contact."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pup.diagnosis import fitting
-from pup.diagnosis.beginnings import nearer
+from pup.diagnosis.beginnings import begun, nearer
 from pup.diagnosis.coordinates import nominal_coordinate
 from pup.diagnosis.fit import WIDE, Fit
 from pup.diagnosis.fitting import STEP, difference, differentiate, fit_together
@@ -15,6 +17,7 @@ from pup.diagnosis.residuals import Measured
 from pup.physics.parameters import robot_space
 from pup.recording import load_recordings
 from pup.robot import RobotDescription
+from tests.diagnosis_cases import BENCH, recordings
 
 Array = NDArray[np.float64]
 
@@ -106,3 +109,16 @@ def test_slopes_in_contact_are_told_across_two_percent() -> None:
         slope = replays.measured.whiten((moved - here)[None], noise)[0] / step
         assert fit.jacobian is not None and some.any()
         np.testing.assert_allclose(fit.jacobian[some, 0], slope[some], rtol=1e-6, atol=1e-6)
+
+
+def test_a_log_that_pauses_after_its_first_row_has_no_beginning() -> None:
+    """The two rows that are its first second alone would pass for a clock in ms."""
+    first, second, *_ = recordings({})
+    paused = replace(first, time=np.r_[0.0, 1.6 + second.time[1:]])
+    measured = Measured.of(BENCH, [paused, replace(second, repeat_of=None)])
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    stiffness = nominal_coordinate(replays.space, "kp/servo")
+    described = float(replays.space.nominal[replays.space.names.index("kp/servo")])
+    fit = Fit((stiffness,), np.array([stiffness.coordinate(described)]))
+    begun([fit], replays, assumed_noise(measured))
+    assert stiffness.lower < fit.at[0] < stiffness.upper

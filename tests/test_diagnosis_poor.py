@@ -9,7 +9,7 @@ import pytest
 from pup.diagnosis.poor import why_poor
 from pup.diagnosis.residuals import Measured
 from pup.recording import Recording
-from pup.recording_cuts import thinned
+from pup.recording_cuts import beginning, thinned
 from pup.robot import RobotDescription
 
 LEG = RobotDescription.load("darwin_leg")
@@ -82,6 +82,7 @@ def test_a_noiseless_encoder_at_rest_is_not_clipped() -> None:
     ("spoil", "why", "cure"),
     [
         (lambda runs: runs[:1], "second motion", ""),
+        (lambda runs: [runs[0], beginning(runs[1], 0.0)], "only step has readings", ""),
         (lambda runs: [thinned(r, 7) for r in runs], "0.21 s apart", "20 Hz"),
         (lambda runs: changed(runs, KNEE, lambda q: 0 * q + q[0]), "l_knee hardly moves", "mended"),
         (lambda runs: changed(runs, PITCH, lambda q: q.clip(-0.15, 0.15)), "l_ank_pitch stop",

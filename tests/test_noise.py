@@ -41,6 +41,13 @@ def test_a_joint_that_diverged_is_as_noisy_as_the_others() -> None:
     assert told.sigma[: len(measured.robot.joints)] == pytest.approx(SIGMA, rel=0.35)
 
 
+def test_a_joint_that_rests_as_it_is_simulated_is_not_free_of_noise() -> None:
+    """One that nothing moves is simulated to the last digit of what its encoder tells."""
+    measured = Maker(RobotDescription.load("darwin_leg")).measured
+    told = quiet_noise(measured, np.where(measured.channel == 2, 0.0, errors(measured)))
+    assert told.sigma[2] == pytest.approx(SIGMA / np.sqrt(2), rel=0.25)
+
+
 @pytest.mark.parametrize("joint", [0, 3])
 def test_a_noisier_joint_is_believed_and_a_quieter_one_by_half(joint: int) -> None:
     """A joint that friction holds flickers less at rest than it does in motion."""

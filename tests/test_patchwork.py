@@ -13,6 +13,8 @@ from pup.diagnosis.patchwork import CHANCE, patched
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.verdict import Alternative, Finding
 from pup.physics.terms import Place
+from pup.robot import RobotDescription
+from tests.diagnoses import Maker
 from tests.diagnosis_cases import BENCH, recordings
 
 MEASURED = Measured.of(BENCH, recordings({}))
@@ -73,3 +75,25 @@ def test_what_is_known_to_have_no_name_is_as_likely_at_least() -> None:
     assert raised == replace(known, probability=CHANCE)
     assert told(PATCHES, 3.0, named(NAMELESS, 0.9)) == named(NAMELESS, 0.9)
     assert told(PATCHES[:1], 3.0, known) == known
+
+
+def test_of_joints_that_tell_nothing_none_is_astray() -> None:
+    """The last joint of a robot may never have been read after a recording's first moments."""
+    leg = Maker(RobotDescription.load("darwin_leg"))
+    joints = len(leg.robot.joints)
+    read = leg.measured.channel < joints - 1
+    part = replace(
+        leg.measured,
+        **{
+            n: getattr(leg.measured, n)[read]
+            for n in ("index", "values", "recording", "channel", "time")
+        },
+    )
+    errors = (
+        0.002 * (1 + 9 * (part.channel == 1)) * np.random.default_rng(0).normal(size=read.sum())
+    )
+    fit = Fit((), np.empty(0), residual=errors / 0.002, jacobian=np.empty((len(errors), 0)))
+    model = Model((), 0, fit, np.zeros(1), part, predicted=part.values - errors)
+    noise = Noise(np.full(joints + 2, 0.002), np.zeros(joints + 2), "repeats")
+    finding = patched(PATCHES, None, held_out(part, model, model, 0), model, noise, [])
+    assert finding is not None and finding.place.name == leg.robot.joint_names[1]

@@ -13,6 +13,8 @@ from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together, start_best
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Noise
+from pup.recording import Recording
+from pup.recording_rules import MAX_TICK
 
 HORIZONS = (1.0, 2.5)
 """Seconds of each recording that a first fit is made to, then a second one: with all of it at once,
@@ -25,13 +27,21 @@ SPARE = 0.02
 
 def begun(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Fits brought near by how the recordings begin."""
-    time = replays.measured.time
+    measured = replays.measured
     for horizon in HORIZONS:
-        inside = time < horizon
-        if inside.any() and not inside.all():
+        inside = measured.time < horizon
+        ready = all(_under_way(r, horizon) for r in measured.recordings)
+        if ready and inside.any() and not inside.all():
             part = replays.shortened(horizon)
             moved(fits, part, noise, inside)
             replays.simulated += round(inside.mean() * part.simulated)
+
+
+def _under_way(recording: Recording, until: float) -> bool:
+    """Whether a recording has begun by then: a log may pause after its first rows."""
+    elapsed = recording.time - recording.time[0]
+    ticks = np.diff(elapsed[elapsed < until])
+    return len(ticks) > 0 and float(np.median(ticks)) <= MAX_TICK
 
 
 def moved(fits: Sequence[Fit], replays: Replays, noise: Noise, part: NDArray[np.bool_]) -> None:

@@ -70,5 +70,5 @@ def patched(
 def _worst(model: Model, errors: Array, noise: Noise) -> int:
     """The joint that is furthest astray, by its noise."""
     channel, joints = model.measured.channel, len(model.measured.robot.joints)
-    sums = np.bincount(channel, errors)[:joints] / np.bincount(channel)[:joints].clip(1)
-    return int(np.argmax(sums / noise.sigma[:joints] ** 2))
+    sums, counts = (np.bincount(channel, w, minlength=joints)[:joints] for w in (errors, None))
+    return int(np.argmax(sums / counts.clip(1) / noise.sigma[:joints] ** 2))

@@ -11,7 +11,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.residuals import Measured
+from pup.diagnosis.residuals import SETTLING, Measured
 from pup.physics.terms.scale import Scale
 from pup.sysid.accuracy import JointUnits
 
@@ -75,8 +75,13 @@ def _reasons(measured: Measured) -> Iterator[Poor]:
     if max(moves) < MOTION * angle and max(wanted) < ASKED * angle:
         unit = JointUnits.of(measured.robot, measured.recordings).position
         yield Poor(f"no joint moves by more than {MOTION * angle:.2g} {unit}")
-    if len(measured.recordings) < 2:
-        yield Poor("one recording leaves nothing to check a finding on; record a second motion")
+    read = [r.id for i, r in enumerate(measured.recordings) if measured.only([i]).any()]
+    if len(read) < 2:
+        only = f"only {read[0]} has readings after its first {SETTLING:g} s, and "
+        yield Poor(
+            f"{only if len(every) > 1 else ''}one recording leaves nothing to check a finding on; "
+            "record a second motion"
+        )
     step = np.diff(measured.time)
     apart = float(np.median(step[step > 0]))
     if apart > SLOWEST:
