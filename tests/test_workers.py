@@ -1,5 +1,7 @@
 """Fits on a real Ray: the same to the last bit as in one process, whatever is killed meanwhile."""
 
+import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +13,10 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import ray
 
+from pup.diagnosis.replays import Replays
+from pup.diagnosis.residuals import Measured
 from pup.errors import InputError
 from pup.physics.parameters import robot_space
 from pup.recording import load_recordings
@@ -20,7 +25,8 @@ from pup.sysid.fit import FitResult, FitSettings
 from pup.sysid.problem import Problem
 from workers import fits as module
 from workers.cluster import connected
-from workers.fits import Fit, LocalRunner, RayRunner, Status
+from workers.fits import Fit, LocalRunner, RayRunner, Status, fetched
+from workers.hypotheses import ray_runner
 
 pytestmark = pytest.mark.ray
 GENERATIONS = 12
@@ -176,6 +182,40 @@ def test_what_a_node_cannot_write_is_nobodys_input(
     with pytest.raises(OSError, match="on a node of the cluster") as caught:
         runner.run(fits[1:2], tmp_path / "file", lambda _: None)
     assert caught.value.filename is None  # by which `pup` tells bad input
+
+
+def test_what_a_replay_refuses_is_told_in_its_own_words(
+    runner: RayRunner, fits: list[Fit], tmp_path: Path
+) -> None:
+    """As where a node does not have the robot's folder: Ray's words are a coloured traceback."""
+    problem = fits[1].problem
+    folder = shutil.copytree(problem.robot.folder, tmp_path / "leg")
+    robot = RobotDescription.load(folder)
+    measured = Measured.of(robot, problem.recordings)
+    shutil.rmtree(folder)
+    replays = Replays(measured, robot_space(robot, "pd"), ray_runner(measured, "pd"), 1)
+    with pytest.raises(InputError, match=f"^{robot.model_path}: MuJoCo refuses it") as caught:
+        replays([{}])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("through_another", [False, True])
+def test_a_process_that_is_lost_too_often_is_told_in_a_line(
+    runner: RayRunner, through_another: bool
+) -> None:
+    """What an actor asks for is lost by others than what this process does."""
+
+    def end() -> None:
+        os._exit(1)
+
+    lost = ray.remote(max_retries=0)(end)
+
+    def ask() -> None:
+        ray.get(lost.remote())
+
+    asked = ray.remote(ask) if through_another else lost
+    with pytest.raises(ConnectionError, match=r"lost again and again.*the same command resumes"):
+        fetched(asked.remote())
 
 
 def test_what_is_wrong_with_an_input_is_told_as_such(

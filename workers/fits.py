@@ -140,7 +140,7 @@ class RayRunner:
                     running[run] = (i, actor)
                 for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
                     i, actor = running[reference]
-                    results[i] = _result(reference)
+                    results[i] = fetched(reference)
                     del running[reference]
                     self._idle.append(actor)
                     statuses[i] = _done(fits[i], results[i])
@@ -156,20 +156,26 @@ def _actor() -> Any:
     return FitActor.remote()  # type: ignore[attr-defined]  # Ray adds it
 
 
-def _result(reference: Any) -> FitResult:
-    """An actor's result; what went wrong in it is raised as it was there.
+def fetched(reference: Any) -> Any:
+    """What a task or an actor answers; what went wrong in it is raised as it was there.
 
     Raises:
-      OSError: without a file's name, for what a node cannot read or write is nobody's input.
+      OSError: without a file's name, for what a node cannot read or write is nobody's input; a
+        ConnectionError where its processes were lost more often than they are replaced.
     """
     try:
         return ray.get(reference)
-    except RayTaskError as error:
+    except RayError as error:
         cause: BaseException = error
         while isinstance(cause, RayTaskError) and cause.cause is not None:
             cause = cause.cause  # what a task raised comes wrapped once more by the actor
         if isinstance(cause, OSError):
             raise OSError(f"on a node of the cluster: {cause}") from error
+        if isinstance(cause, RayError) and not isinstance(cause, RayTaskError):
+            raise ConnectionError(
+                "a process on the cluster was lost again and again, perhaps for want of memory; "
+                "the same command resumes"
+            ) from error
         raise cause from error
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.replays import Batch, Bench, Runner
 from pup.diagnosis.residuals import Measured
-from workers.fits import RETRIES
+from workers.fits import RETRIES, fetched
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ def ray_runner(measured: Measured, actuator: str) -> Runner:
     name = shared.hex()
 
     def run(batches: Sequence[Batch]) -> list[Array]:
-        answers = [replay.remote(name, [shared], actuator, batch) for batch in batches]
-        return list(ray.get(answers))
+        asked = [replay.remote(name, [shared], actuator, batch) for batch in batches]
+        return [fetched(one) for one in asked]
 
     return run
 

@@ -58,7 +58,9 @@ Viewer = Annotated[User, needs(Role.VIEWER)]
 Operator = Annotated[User, needs(Role.OPERATOR)]
 
 READ = responses(400, 401, 403, 404, 422)
-WRITE = responses(400, 401, 403, 404, 409, 411, 413, 422)
+STOP = responses(400, 401, 403, 404, 409, 411, 413, 422)
+DATABASE = responses(503)
+WRITE = STOP | DATABASE
 v1 = APIRouter(prefix="/v1", route_class=IdempotentRoute)
 emergency = APIRouter(prefix="/v1")
 """What must not wait for the database; done twice it does no harm."""
@@ -224,7 +226,7 @@ async def get_posterior(request: Request, _: Viewer, study: StudyName) -> Respon
     return as_json(await conductor_of(request).posterior(study))
 
 
-@v1.get("/studies/{study:name}/history", response_model=EventList, responses=READ)
+@v1.get("/studies/{study:name}/history", response_model=EventList, responses=READ | DATABASE)
 async def list_events(
     request: Request,
     _: Viewer,
@@ -352,7 +354,7 @@ async def stream_agents(request: Request, _: Viewer) -> Response:
 
 
 @emergency.post(
-    "/agents/{agent:name}:stop", status_code=202, responses=WRITE, openapi_extra=reason_or_none()
+    "/agents/{agent:name}:stop", status_code=202, responses=STOP, openapi_extra=reason_or_none()
 )
 async def stop_agent(
     request: Request, user: Operator, agent: AgentName, key: IdempotencyKey = None
