@@ -165,6 +165,9 @@ def test_what_is_not_there_is_told(service):
     with service.client() as http:
         assert "no study nowhere" in is_problem(http.get("/v1/studies/nowhere"), 404)
         is_problem(http.post("/v1/agents/nobody:stop", json={"reason": "x"}), 404)
+        http.post("/v1/studies", json=STUDY | {"name": "short", "gate": "operator"})
+        missing = http.post("/v1/studies/short/trials/99:release")
+        assert "has no trial 99" in is_problem(missing, 404)
         is_problem(http.get("/v1/none"), 404)
         is_problem(http.put("/v1/studies"), 405)
         assert http.options("/v1/studies").headers["allow"] == "GET, POST"
@@ -178,6 +181,7 @@ def test_the_same_key_is_carried_out_once(service):
         again = http.post("/v1/studies", json=asked, headers=key)
         assert (again.status_code, again.content) == (first.status_code, first.content)
         assert again.headers["idempotent-replayed"] == "true"
+        assert again.headers["location"] == first.headers["location"] == "/v1/studies/keyed"
         other = http.post("/v1/studies", json=asked | {"name": "other"}, headers=key)
         assert "another request" in is_problem(other, 409)
         assert http.get("/v1/studies/other").status_code == 404

@@ -13,6 +13,7 @@ pytest.importorskip("botorch")
 import fake_agent
 import gateways
 import msgpack
+from test_gateway import until
 from zmq.utils.monitor import recv_monitor_message
 
 from pup.wire import SIZE_LIMIT, Finished, Heartbeat, Hello, Message, Outcome, encode
@@ -276,8 +277,14 @@ def test_a_revoked_agent_is_heard_no_more(service, context):
     socket.send(encode(Message(Heartbeat())))
     assert socket.poll(10_000)
     socket.recv()
-    KeyRing(service.data / "curve").revoke_agent("fired")
-    time.sleep(2.5)
+    with service.client("viewer") as http:
+
+        def listed():
+            return "fired" in [a["name"] for a in http.get("/v1/agents").json()["agents"]]
+
+        assert listed()
+        KeyRing(service.data / "curve").revoke_agent("fired")
+        until(lambda: not listed())
     socket.send(encode(Message(Heartbeat())))
     assert not socket.poll(1500)
     socket.close()

@@ -33,7 +33,7 @@ from pup.wire import (
 from services.gateway.agents import AgentView
 from services.gateway.conductor import Conductor
 from services.gateway.metrics import Metrics
-from services.gateway.posteriors import NOTHING, Posteriors
+from services.gateway.posteriors import NOTHING, Posteriors, StoppingError
 from services.gateway.store import Change, ReplacedError, Store
 
 POLICY = "a" * 64
@@ -269,6 +269,12 @@ def test_a_page_does_not_wait_for_a_slow_process_and_many_pages_ask_for_one():
         assert [row["walks"] for row in await asyncio.gather(*waiting)] == [9, 9, 9]
         assert len(asked) == 1 and told == ["s"]
         assert (await made.soon(study, None, 0.05))["walks"] == 9
+        ready.clear()
+        waiting = [asyncio.create_task(made.of(Study("t", SETTINGS), None)) for _ in range(2)]
+        await asyncio.sleep(0.05)
+        made.stop()
+        ends = await asyncio.gather(*waiting, return_exceptions=True)
+        assert [type(end) for end in ends] == [StoppingError] * 2
 
     asyncio.run(asyncio.wait_for(live(), 120))
 

@@ -103,6 +103,20 @@ def test_metrics_tell_how_long_a_robot_was_not_heard_whose_key_was_revoked():
     assert age("pup_agent_heartbeat_age_seconds", {"agent": "never"}) is None
 
 
+def test_metrics_tell_no_health_of_a_robot_that_is_away():
+    from services.gateway.conductor import Conductor
+
+    conductor = Conductor(None, None, Metrics())
+    view = conductor.agents["a"] = AgentView("a", heard=time.monotonic(), health={"volts": 12.0})
+    told = conductor.metrics.registry.get_sample_value
+    conductor.measure()
+    assert told("pup_agent_health", {"agent": "a", "name": "volts"}) == 12.0
+    view.heard -= 60
+    conductor.measure()
+    assert told("pup_agent_health", {"agent": "a", "name": "volts"}) is None
+    assert told("pup_agent_heartbeat_age_seconds", {"agent": "a"}) >= 60
+
+
 def _hello(version):
     told = Hello("swapped", "darwin_op2", version, (Policy("walk", fake_agent.POLICY),))
     return encode(Message(told))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from pup.errors import InputError
-from pup.transfer.trial import OPEN, TOLD, Eta, Purpose, Trial, TrialError, TrialState
+from pup.transfer.trial import OPEN, TOLD, Eta, Purpose, Trial, TrialError, TrialState, UnknownError
 
 
 class Gate(StrEnum):
@@ -113,10 +113,10 @@ class Study:
         """The trial of a number.
 
         Raises:
-          TrialError: there is none.
+          UnknownError: there is none.
         """
         if not 1 <= number <= len(self.trials):
-            raise TrialError(f"study {self.name} has no trial {number}")
+            raise UnknownError(f"study {self.name} has no trial {number}")
         return self.trials[number - 1]
 
     def with_trial(self, trial: Trial) -> "Study":

@@ -93,6 +93,10 @@ class TrialError(InputError):
     """A change that the state of a trial does not allow; told in one line."""
 
 
+class UnknownError(TrialError):
+    """There is nothing of this name or number."""
+
+
 @dataclass(frozen=True)
 class Result:
     """How an attempt ended.

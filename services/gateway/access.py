@@ -103,11 +103,13 @@ class IdempotentRoute(APIRoute):
                     if before.request != digest:
                         raise HTTPException(409, "this Idempotency-Key had another request")
                     headers = {"Idempotent-Replayed": "true"}
+                    if before.location:
+                        headers["Location"] = before.location
                     return Response(before.body, before.status, headers, "application/json")
                 response = await handle(request)
                 if response.status_code < 300:
-                    answer = Answer(key, user.name, digest, response.status_code, response.body)
-                    await store.answered(answer)
+                    made = response.status_code, response.body, response.headers.get("Location")
+                    await store.answered(Answer(key, user.name, digest, *made))
                 return response
             finally:
                 del locks[mine]

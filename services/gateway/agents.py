@@ -27,6 +27,7 @@ class AgentView:
       sample: the newest of the rollout under way.
       stop: that its robot was sent and has not obeyed yet.
       held: why it is given no trial, since it was stopped; empty once a study goes on.
+      admitted: whether its key is known still.
     """
 
     name: str
@@ -39,6 +40,7 @@ class AgentView:
     sample: Sample | None = None
     stop: Stop | None = None
     held: str = ""
+    admitted: bool = True
     _shown: tuple[bool, AgentState | None] = (False, None)
 
     @property

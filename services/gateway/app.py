@@ -339,8 +339,7 @@ def _trial(study: Study, number: int) -> Response:
 @v1.get("/agents", response_model=AgentList, responses=responses(401, 403))
 async def list_agents(request: Request, _: Viewer) -> Response:
     """Agents that are let in, and how they are."""
-    agents = conductor_of(request).agents
-    return as_json({"agents": [agents[name].document() for name in sorted(agents)]})
+    return as_json({"agents": [view.document() for view in conductor_of(request).admitted]})
 
 
 @v1.get(

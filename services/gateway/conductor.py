@@ -30,6 +30,7 @@ from pup.transfer.trial import (
     Trial,
     TrialError,
     TrialState,
+    UnknownError,
     Verdict,
 )
 from pup.wire import Accepted, Armed, Cancel, Finished, Running
@@ -52,10 +53,6 @@ REPORTED = {
     Armed: TrialState.ARMED,
     Running: TrialState.RUNNING,
 }
-
-
-class UnknownError(TrialError):
-    """There is no such study or agent."""
 
 
 class Conductor:
@@ -109,6 +106,11 @@ class Conductor:
         for name in list(self.studies):
             if self.studies[name].state is not StudyState.DONE:
                 self._go_on(name)
+
+    @property
+    def admitted(self) -> list[AgentView]:
+        """The agents whose keys are known, by name."""
+        return [view for _, view in sorted(self.agents.items()) if view.admitted]
 
     def study(self, name: str) -> Study:
         """A study by its name.
@@ -262,6 +264,7 @@ class Conductor:
         states = [s.state for s in self.studies.values()]
         for state in StudyState:
             self.metrics.studies.labels(state.value).set(states.count(state))
+        self.metrics.health.clear()
         for view in self.agents.values():
             self.metrics.agent(view)
 

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pup.errors import InputError
-from pup.transfer.trial import TrialError
-from services.gateway.conductor import UnknownError
+from pup.transfer.trial import TrialError, UnknownError
 from services.gateway.jobs import Job, JobState, Seen, Status, reconciled
 from services.gateway.metrics import Metrics
 from services.gateway.ray_jobs import RayAwayError, RayJobs

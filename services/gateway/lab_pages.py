@@ -62,7 +62,7 @@ async def start(request: Request) -> Response:
     if (user := asking(request)) is None:
         return login()
     conductor, jobs = conductor_of(request), dispatcher_of(request).newest()
-    agents = conductor.agents.values()
+    agents = conductor.admitted
     tiles = [
         await on_storage(_recordings_tile, _shelves(request)),
         _tile(BOUNDS, await _documents(request, BOUNDS)),

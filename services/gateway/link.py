@@ -122,6 +122,10 @@ class Link:
             self.conductor.agents[name].hello = None  # it can be given no trial
         for name in self.names.values():
             self.conductor.agents.setdefault(name, AgentView(name))
+        admitted = set(self.names.values())
+        for name, view in self.conductor.agents.items():
+            view.admitted = name in admitted
+        self.conductor.notify("")
 
     async def run(self) -> None:
         """Receive until the process ends; what one agent says waits for no other's."""

@@ -60,9 +60,11 @@ class Metrics:
         )
 
     def agent(self, view: AgentView) -> None:
-        """Bring the gauges of an agent up to date."""
+        """Bring the gauges of an agent up to date; how one is that is away, nobody knows."""
         if math.isfinite(view.silent):
             self.silence.labels(view.name).set(view.silent)
+        if not view.present:
+            return
         numbers = [(k, v) for k, v in view.health.items() if isinstance(v, int | float)]
         for name, value in numbers[:HEALTH_LIMIT]:
             self.health.labels(view.name, name).set(value)

@@ -162,7 +162,7 @@ async def agents(request: Request) -> Response:
     if (user := asking(request)) is None:
         return login()
     conductor: Conductor = request.app.state.conductor
-    told = [conductor.agents[name].document() for name in sorted(conductor.agents)]
+    told = [view.document() for view in conductor.admitted]
     for agent in told:
         agent["health"] = list(agent["health"].items())[:SHOWN]
     name = part(request, "agents.html", "agents_live.html")

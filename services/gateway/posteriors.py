@@ -7,6 +7,11 @@ from pup.transfer.study import Study
 from services.gateway import fits
 from services.gateway.records import Row
 
+
+class StoppingError(Exception):
+    """The gateway stops before a process is fitted."""
+
+
 NOTHING: Row = {"walks": 0, "best": None, "slices": []}
 
 
@@ -34,7 +39,12 @@ class Posteriors:
             task = asyncio.create_task(self._fits.run(fits.posterior, study, simulated))
             task.add_done_callback(lambda done: self._done(study.name, walks, done))
             self._tasks[study.name] = walks, task
-        return await asyncio.shield(task)
+        try:
+            return await asyncio.shield(task)
+        except asyncio.CancelledError:
+            if task.cancelled():  # not the request, but the fit
+                raise StoppingError("the gateway stops; ask again when it is back") from None
+            raise
 
     async def soon(self, study: Study, simulated: Row | None, seconds: float) -> Row:
         """The process, or after some time the latest there is: of fewer walks, or of none."""
@@ -42,6 +52,11 @@ class Posteriors:
             return await asyncio.wait_for(self.of(study, simulated), seconds)
         except TimeoutError:
             return self._kept.get(study.name, ("", NOTHING))[1]
+
+    def stop(self) -> None:
+        """Let nobody wait any more: the gateway stops."""
+        for _, task in self._tasks.values():
+            task.cancel()
 
     def _done(self, name: str, walks: str, task: asyncio.Task[Row]) -> None:
         if self._tasks.get(name, ("", None))[1] is task:

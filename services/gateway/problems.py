@@ -13,9 +13,9 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from pup.errors import InputError
-from pup.transfer.trial import TrialError
-from services.gateway.conductor import UnknownError
+from pup.transfer.trial import TrialError, UnknownError
 from services.gateway.dispatcher import NoJobsError
+from services.gateway.posteriors import StoppingError
 from services.gateway.store import ReplacedError
 
 log = logging.getLogger(__name__)
@@ -91,6 +91,10 @@ def handle(app: FastAPI) -> None:
     @app.exception_handler(NoJobsError)
     async def of_jobs(request: Request, error: NoJobsError) -> JSONResponse:
         return problem(503, str(error), request)
+
+    @app.exception_handler(StoppingError)
+    async def of_stopping(request: Request, error: StoppingError) -> JSONResponse:
+        return problem(503, str(error), request, **{"Retry-After": "5"})
 
     @app.exception_handler(ReplacedError)
     async def of_replaced(request: Request, error: ReplacedError) -> JSONResponse:

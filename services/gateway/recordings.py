@@ -10,7 +10,7 @@ from pathlib import Path
 from pup.errors import InputError
 from pup.recording import Recording
 from pup.recording_file import Header, read_header
-from services.gateway.conductor import UnknownError
+from pup.transfer.trial import UnknownError
 from services.gateway.storage import on_storage
 from services.job_folder import below, inside
 

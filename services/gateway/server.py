@@ -210,6 +210,8 @@ class _Server(uvicorn.Server):
         yield
 
     def stop(self) -> None:
-        """Take no more requests and end streams."""
-        self.config.app.state.stopping = True  # type: ignore[union-attr]  # it is no name of one
+        """Take no more requests, and end streams and what waits for a fit."""
+        state = self.config.app.state  # type: ignore[union-attr]  # it is no name of one
+        state.stopping = True
+        state.conductor.posteriors.stop()
         self.should_exit = True

@@ -9,10 +9,10 @@ from typing import Any
 
 from pup.transfer import orders
 from pup.transfer.study import Study
-from pup.transfer.trial import TrialError
+from pup.transfer.trial import TrialError, UnknownError
 from pup.wire import Stop
 from services.gateway.agents import AgentView
-from services.gateway.conductor import Conductor, UnknownError
+from services.gateway.conductor import Conductor
 from services.gateway.store import Event
 
 log = logging.getLogger(__name__)

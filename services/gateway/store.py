@@ -87,6 +87,7 @@ class Answer:
     request: str
     status: int
     body: bytes
+    location: str | None = None
 
 
 class Store:
@@ -177,7 +178,7 @@ class Store:
         table = self.tables["answers"]
         query = sa.select(table).where(table.c.key == key, table.c.who == who)
         row = await self.run(lambda c: c.execute(query).one_or_none())
-        return row and Answer(row.key, row.who, row.request, row.status, row.body)
+        return row and Answer(row.key, row.who, row.request, row.status, row.body, row.location)
 
     async def answered(self, answer: Answer) -> None:
         """Keep an answer for whoever asks again; forget those of last week."""
@@ -186,7 +187,8 @@ class Store:
         def keep(connection: sa.Connection) -> None:
             old = table.c.time < time.time() - ANSWERS_KEPT
             connection.execute(sa.delete(table).where(old))
-            rest = {"request": answer.request, "status": answer.status, "body": answer.body}
+            rest = {"request": answer.request, "status": answer.status}
+            rest |= {"body": answer.body, "location": answer.location}
             where = {"key": answer.key, "who": answer.who}
             self._put(connection, "answers", where, rest | {"time": time.time()})
 
