@@ -47,6 +47,8 @@ EDIT_FIELDS: dict[str, tuple[str, int]] = {
     "jnt_stiffness": ("joint", 1),
     "dof_frictionloss": ("joint", 1),
 }
+SIGNED_FIELDS = frozenset(("body_pos", "body_ipos", "geom_pos", "site_pos", "jnt_range"))
+"""Those that may be negative."""
 
 
 def read_parameters(
@@ -162,6 +164,11 @@ def read_knobs(
             )
         if not knob.edits and not knob.scalings:
             raise entry.mistake("", f"knob {knob.name!r} does nothing; add an edit or a scaling")
+        for edit in knob.edits:
+            least, end = min((edit.scale * e + edit.offset, e) for e in (knob.lower, knob.upper))
+            if least < 0 and edit.field not in SIGNED_FIELDS:
+                told = f"{edit.field} of {edit.element} would be {least:g} at {knob.name} = {end:g}"
+                raise entry.mistake("edit", f"{told}; it cannot be negative")
         knobs.append(knob)
     return tuple(knobs)
 

@@ -95,6 +95,8 @@ class Gateway:
                 if not (why := away(answer)):
                     break
                 self.met = self.met or "Retry-After" in answer.headers
+            except httpx.ReadTimeout as error:  # somebody is there, and slow
+                why, self.met = str(error), True
             except httpx.HTTPError as error:
                 why = str(error) or type(error).__name__
             except ValueError as error:  # a key beyond ASCII, a number that JSON does not know

@@ -190,6 +190,10 @@ def test_groups_are_told_by_names(name: str, group: str) -> None:
     [
         ("<robot name='r'><link name='a'/></robot>", "no hinge or slide joint"),
         ("<robot", "MuJoCo refuses it"),
+        (
+            "<robot xmlns:xacro='x'><xacro:arm/></robot>",
+            "what `xacro walker.urdf > robot.urdf` makes",
+        ),
         (WALKER.replace('<sphere radius="0.02"/>', '<mesh filename="a.stl"/>'), "is not there"),
         (WALKER.replace("</robot>", f"{ODOMETRY}</robot>"), "'base' is free, but hangs on 'odom'"),
     ],

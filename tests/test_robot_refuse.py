@@ -61,6 +61,7 @@ WRONG_ROBOT = [
     ("l = 0.5", "x = 0.5", "poses.open.x: unknown key"),
     ("upper = 2\n", "upper = 0\n", "knob[1].lower: 0 is not below upper = 0"),
     ("default = 0", "default = 3", "knob[1].default: 3 is outside [0, 2]"),
+    ("offset = 1.0", "offset = -1.0", "body_mass of trunk would be -1 at load = 0; it cannot be"),
     ('"body_mass"', '"body_parentid"', "knob[1].edit[1].field: 'body_parentid' cannot be edited"),
     ('"body_mass"', '"body_ipos"', "index: body_ipos has 3 components; give 0 to 2"),
     ("offset = 1.0", "index = 0", "index: body_mass is a single number; remove the index"),

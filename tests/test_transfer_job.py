@@ -5,7 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import agents
 import fake_agent
@@ -176,3 +178,32 @@ def test_tokens_and_keys_by_command(tmp_path, monkeypatch):
     assert pup("serve", "revoke-agent", "darwin").code == 0
     assert pup("serve", "revoke-token", "ann").code == 0
     assert "ann" not in (tmp_path / "data/tokens.json").read_text()
+
+
+class Slow(BaseHTTPRequestHandler):
+    """Answers the first request only after whoever asked has given up."""
+
+    asked = 0
+
+    def do_GET(self):
+        Slow.asked += 1
+        if Slow.asked == 1:
+            time.sleep(0.6)
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b'{"here": true}')
+
+    def log_message(self, *args):
+        pass
+
+
+def test_a_gateway_that_is_slow_at_first_is_waited_for(monkeypatch):
+    monkeypatch.setattr(transfer, "TIMEOUT", 0.2)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Slow)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    heard = []
+    gateway = transfer.Gateway(f"http://127.0.0.1:{server.server_port}", "token", heard.append)
+    assert gateway.get("/v1/studies") == {"here": True}
+    assert any("waiting" in told for told in heard)
+    server.shutdown()
+    server.server_close()

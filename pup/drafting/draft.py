@@ -94,6 +94,9 @@ def draft_robot(source: Path, folder: Path, name: str = "", free: bool = False) 
         raise InputError(f"{source}: cannot be read; change its rights")
     if source.suffix.lower() not in KINDS:
         raise InputError(f"{source}: name an MJCF file (.xml) or a URDF file (.urdf)")
+    if b"<xacro:" in source.read_bytes():
+        told = f"describe what `xacro {source.name} > robot.urdf` makes of it"
+        raise InputError(f"{source}: is a source of xacro; {told}")
     if name and not NAME.fullmatch(name):
         raise InputError(f"--name: {name!r} is no name; use letters, digits, '_', '.' and '-'")
     _refuse_to_overwrite(folder, [Path("robot.toml"), Path("model.xml")])
