@@ -124,6 +124,7 @@ class RobotDescription:
         groups = read_groups(table, joints)
         torso = read_torso(table, model)
         feet = read_feet(table, model)
+        imu_site = read_imu_site(table, model)
         parameters = read_parameters(table, groups, torso, model)
         network = read_network(table, parameters)
         poses = read_poses(table, joints)
@@ -133,13 +134,13 @@ class RobotDescription:
             joints=joints,
             groups=groups,
             torso=torso,
-            imu_site=read_imu_site(table, model),
+            imu_site=imu_site,
             feet=feet,
             floating=model.floating is not None,
             poses=poses,
             knobs=read_knobs(table, parameters, model),
             parameters=parameters,
-            terms=read_terms(table, joints, groups, feet, model),
+            terms=read_terms(table, joints, groups, feet, imu_site, model),
             gait=read_gait(table, joints, poses, feet, model),
             walk=read_walk(table),
             network=network,

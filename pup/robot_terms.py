@@ -16,6 +16,7 @@ def read_terms(
     joints: tuple[Joint, ...],
     groups: tuple[str, ...],
     feet: tuple[str, ...],
+    imu_site: str | None,
     model: MjcfNames,
 ) -> tuple[TermSpec, ...]:
     """Read the terms; an effect stands once at a place."""
@@ -32,6 +33,11 @@ def read_terms(
         kinds = [known for known in get_args(PlaceKind) if known == kind]
         if not kinds:
             raise place.mistake("kind", f"{kind!r} is none of {listed(get_args(PlaceKind))}")
+        lacks = {"sensor": "IMU (imu_site)" * (not imu_site), "ground": "feet" * (not feet)}
+        if lacking := lacks.get(kind):
+            raise place.mistake(
+                "kind", f"the robot has no {lacking}, and the term would do nothing"
+            )
         name = _name(place, kinds[0], names, model)
         place.close()
         quantities = entry.table("values")

@@ -109,6 +109,23 @@ def test_a_wrong_robot_toml_is_refused(tmp_path: Path, old: str, new: str, words
     refused(robot_folder(tmp_path, robot=swap(old, new)(ROBOT)), words)
 
 
+@pytest.mark.parametrize(
+    ("key", "kind", "words"),
+    [
+        ('imu_site = "imu"\n', "sensor", "term[1].place.kind: the robot has no IMU (imu_site)"),
+        ('feet = ["left", "right"]\n', "ground", "term[1].place.kind: the robot has no feet"),
+    ],
+)
+def test_a_term_of_what_a_robot_has_not_is_refused(
+    tmp_path: Path, key: str, kind: str, words: str
+) -> None:
+    term = (
+        f'[[term]]\neffect = "imu_delay"\nplace = {{ kind = "{kind}" }}\nvalues = {{ time = 0.01 }}'
+    )
+    walk = ROBOT.partition("[gait]")[0]
+    refused(robot_folder(tmp_path, robot=swap(key, "")(walk) + term), words)
+
+
 WRONG_MODEL = [
     ('<joint name="r"/>', "", "joint[2].name: model.xml has no joint 'r'; it has: l"),
     ('"r"/>', '"r"/><joint name="s"/>', "joint: model.xml also has: s; list every joint"),
