@@ -33,13 +33,24 @@ class Trace:
       hypothesis: of one effect, place and shape.
       whole: whitened change of the samples per typical size, shape (n_samples, n_magnitudes).
       left: what of it the nominal parameters cannot imitate.
-      basis: orthonormal columns that span `left`, shape (n_samples, n_seen).
+      directions: orthonormal columns that span `left`, shape (n_samples, n_seen); None where `left`
+        is one column, for a whole robot has thousands of these.
     """
 
     hypothesis: Hypothesis
     whole: Array
     left: Array
-    basis: Array
+    directions: Array | None = None
+
+    @property
+    def basis(self) -> Array:
+        """Orthonormal columns that span `left`, shape (n_samples, n_seen)."""
+        return _unit(self.left) if self.directions is None else self.directions
+
+    @property
+    def seen(self) -> int:
+        """How many magnitudes the data show."""
+        return 1 if self.directions is None else self.directions.shape[1]
 
     @property
     def absorbed(self) -> float:
@@ -99,19 +110,17 @@ def traced(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | 
 
 
 def _seen(hypothesis: Hypothesis, whole: Array, project: Projector) -> Trace | None:
-    left = project(whole)
-    vectors, lengths = _directions(left)
-    seen = (lengths > FAINT) & (lengths > SEEN * np.linalg.norm(whole))
+    left, least = project(whole), SEEN * np.linalg.norm(whole)
+    if left.shape[1] == 1:  # as nearly all of them are: no decomposition
+        length = float(np.linalg.norm(left))
+        return Trace(hypothesis, whole, left) if length > FAINT and length > least else None
+    vectors, lengths, _ = np.linalg.svd(left, full_matrices=False)
+    seen = (lengths > FAINT) & (lengths > least)
     return Trace(hypothesis, whole, left, vectors[:, seen]) if seen.any() else None
 
 
-def _directions(columns: Array) -> tuple[Array, Array]:
-    """Orthonormal directions of columns (n_samples, n), and how long they are along each."""
-    if columns.shape[1] == 1:  # as nearly all of them are: no decomposition
-        length = np.linalg.norm(columns, axis=0)
-        return columns / np.maximum(length, np.finfo(float).tiny), length
-    vectors, lengths, _ = np.linalg.svd(columns, full_matrices=False)
-    return vectors, lengths
+def _unit(column: Array) -> Array:
+    return np.asarray(column / max(float(np.linalg.norm(column)), np.finfo(float).tiny))
 
 
 def scores(found: Sequence[Trace], residual: Array) -> list[Score]:
@@ -127,7 +136,7 @@ def scores(found: Sequence[Trace], residual: Array) -> list[Score]:
         statistic, sizes = float(match @ match), _sizes(trace, residual)
         if not trace.hypothesis.signed and sizes[0] < 0:
             statistic = 0.0
-        told.append(Score(trace, statistic, trace.basis.shape[1], sizes))
+        told.append(Score(trace, statistic, trace.seen, sizes))
     return sorted(told, key=lambda s: -s.surprise)
 
 
@@ -167,7 +176,7 @@ def threshold(
     largest: dict[int, Array] = {}  # by freedom: of the same, the largest is the most surprising
     start = 0
     for trace in found:
-        width = trace.basis.shape[1]
+        width = trace.seen
         part = products[start : start + width]
         start += width
         statistic = (part**2).sum(axis=0)

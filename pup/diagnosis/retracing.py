@@ -83,7 +83,7 @@ class Retracer:
 
 def _widths(found: Sequence[Trace]) -> dict[tuple[str, Place], int]:
     """How many parameters of each effect at a place the motions show."""
-    return {t.hypothesis.key: t.basis.shape[1] for t in found}
+    return {t.hypothesis.key: t.seen for t in found}
 
 
 def _whole(ordered: Sequence[Hypothesis], number: int) -> list[Hypothesis]:

@@ -7,7 +7,7 @@ ground everything moves everything and a simulation costs five times as much: th
 simulated together, and one by one only where they look, together, like the errors.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ the ground too."""
 SMALL = 0.1
 """Share of the moderate size at which hypotheses of a single joint are looked at again: where a
 motion hangs by a hair, what much of an effect changes says nothing of what little of it does."""
+AT_ONCE = 300
+"""Hypotheses that are simulated at once: enough for all cores, few enough for the memory."""
 
 
 def traces(
@@ -55,23 +57,25 @@ def traces(
     members = {h for several in together.values() for h in several}
     project = Projector(base.slopes)
 
-    def simulated(some: Iterable[Hypothesis], where: Sequence[int]) -> dict[Hypothesis, Array]:
+    def simulated(
+        some: Iterable[Hypothesis], where: Sequence[int]
+    ) -> Iterator[tuple[Hypothesis, Array]]:
         return _simulated(list(some), where, base, replays, noise)
 
-    wholes = simulated((h for h in hypotheses if h not in together), fixed)
+    wholes = dict(simulated((h for h in hypotheses if h not in together), fixed))
     wholes |= {h: np.sum([wholes[m] for m in several], axis=0) for h, several in together.items()}
     if ground:
-        for h, whole in simulated((h for h in hypotheses if h not in members), ground).items():
-            wholes[h] = wholes[h] + whole
+        for h, whole in simulated((h for h in hypotheses if h not in members), ground):
+            wholes[h] += whole
         seen = (traced(h, wholes[h], project) for h in together)
         ranking = scores([t for t in seen if t is not None], base.residual)
         leading = list(dict.fromkeys(s.trace.hypothesis.key for s in ranking))[:PROMISING]
         close = dict.fromkeys(m for h in together if h.key in leading for m in together[h])
-        for h, whole in simulated(close, ground).items():
-            wholes[h] = wholes[h] + whole
+        for h, whole in simulated(close, ground):
+            wholes[h] += whole
     told = [traced(h, wholes[h], project) for h in hypotheses]
     if len(replays.measured.robot.joints) == 1 and not ground:
-        small = _simulated(hypotheses, fixed, base, replays, noise, SMALL)
+        small = dict(_simulated(hypotheses, fixed, base, replays, noise, SMALL))
         again = [traced(h, small[h], project) for h in hypotheses]
         told = [_likelier(pair, base.residual) for pair in zip(told, again, strict=True)]
     return [trace for trace in told if trace is not None]
@@ -120,16 +124,16 @@ def _simulated(
     replays: Replays,
     noise: Noise,
     share: float = 1.0,
-) -> dict[Hypothesis, Array]:
+) -> Iterator[tuple[Hypothesis, Array]]:
     """Whitened changes of some recordings' samples per typical size, (n_samples, n_magnitudes)."""
-    probes = [probe for h in hypotheses for probe in h.probes(share)]
-    changed = changes([(base.row(), probes, probes)], replays, recordings)[0]
-    white = replays.measured.whiten(changed, noise)
-    ends = np.cumsum([0, *(len(h.magnitudes) for h in hypotheses)])
-    return {
-        h: white[a:b].T / (share * h.moderate)
-        for h, a, b in zip(hypotheses, ends[:-1], ends[1:], strict=True)
-    }
+    for first in range(0, len(hypotheses), AT_ONCE):
+        some = hypotheses[first : first + AT_ONCE]
+        probes = [probe for h in some for probe in h.probes(share)]
+        changed = changes([(base.row(), probes, probes)], replays, recordings)[0]
+        white = replays.measured.whiten(changed, noise)
+        ends = np.cumsum([0, *(len(h.magnitudes) for h in some)])
+        for h, a, b in zip(some, ends[:-1], ends[1:], strict=True):
+            yield h, white[a:b].T / (share * h.moderate)
 
 
 def _together(

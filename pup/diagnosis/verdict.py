@@ -257,7 +257,7 @@ def twins_of(
             other.key
             for other, trace in ((h, score.trace) for h, score in told.items())
             if other.key not in refitted
-            and trace.basis.shape[1] == own.basis.shape[1] == 1
+            and trace.seen == own.seen == 1
             and overlap(trace, own) > TWIN
             and (other.signed or float(trace.left[:, 0] @ change) > 0)
         )
