@@ -79,7 +79,7 @@ def test_one_joint_astray_keeps_its_noise_and_stops_nothing() -> None:
     before = thought(measured, 2e-3)
     after = told_anew(before, measured, remembering(measured, [8e-3, 3e-3, *[2e-3] * 4], 0.0))
     assert after is not None
-    assert after.sigma[0] == 2e-3
+    assert (after.sigma[0], after.rho[0]) == (2e-3, before.rho[0])
     assert after.sigma[1:6] == pytest.approx([3e-3, *[2e-3] * 4], rel=0.2)
 
 

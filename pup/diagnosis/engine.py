@@ -320,7 +320,7 @@ def _explained(
         else ()
     )
     task.progress("next recording", 0.95)
-    ask = _next(named, told.rounds, selector, task.replays_of)
+    ask = _next(named, told.rounds, selector, task)
     assert told.held_out is not None
     known = left.finding if left else odd
     nameless = patched(named, known, told.held_out, told.model, nominal.noise, seen)
@@ -375,15 +375,15 @@ def _next(
     found: Sequence[Finding],
     rounds: Sequence[Round],
     selector: Selector,
-    factory: Callable[[Measured], Replays],
+    task: _Task,
 ) -> NextRecording | None:
     """What to record next: what would settle the most important finding that can be settled."""
-    robot = selector.replays.measured.robot
+    robot = task.measured.robot
     for finding in found:
         if finding.equivalents:
             chosen = chosen_in(rounds, (finding.effect, finding.place))
             rivals = rivals_of(finding, chosen, selector)
-            ask = next_recording(robot, rivals, selector.noise, factory)
+            ask = next_recording(robot, rivals, selector.noise, task.replays_of, task.seed)
             if ask is not None:
                 return ask
     return None

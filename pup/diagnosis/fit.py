@@ -14,6 +14,9 @@ WIDE = 50.0
 """Width of finite differences in contact, in their usual one, until they are narrowed."""
 ENOUGH = 0.2
 """A fit has ended when no step lowers chi-squared by as much."""
+NOISY = 1.5
+"""Up to so many times the noise slopes that are nearly right tell where a fit ends: errors that are
+noise are like no slope, and large ones are like what is wrong with one."""
 ALMOST = 1e-9
 NEAR = 0.05
 """Coordinates so near an end of their range count as there: a twentieth of what is positive."""
@@ -36,6 +39,7 @@ class Fit:
       done: whether no step leads further.
       thorough: whether it ends on a Jacobian of where it stands, not on an updated one.
       narrow: whether it ends on narrow differences in contact.
+      exact: whether its differences are of simulations in the robot's own sub-steps.
       damping: of Levenberg and Marquardt.
       age: steps since the Jacobian was fresh.
       width: of its finite differences, in their usual one.
@@ -57,6 +61,7 @@ class Fit:
     done: bool = False
     thorough: bool = True
     narrow: bool = False
+    exact: bool = False
     damping: float = 1e-2
     age: int = 0
     stuck: int = 0
@@ -75,6 +80,12 @@ class Fit:
     def least(self) -> float:
         """Gain of chi-squared that counts."""
         return max(ENOUGH, self.slack * self.chi2)
+
+    @property
+    def near_noise(self) -> bool:
+        """Whether it leaves little more than noise."""
+        assert self.residual is not None
+        return self.chi2 < NOISY * len(self.residual)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -92,7 +92,10 @@ def start_best(
 def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Give fits the Jacobians they need for a step; those that one promises nothing have ended."""
     complete(fits, replays, noise)
-    differentiate([f for f in fits if f.thorough and f.age > 0 and _ended(f)], replays, noise)
+    doubtful = [f for f in fits if f.thorough and f.age > 0 and _ended(f)]
+    differentiate(doubtful, replays, noise)
+    for fit in doubtful:
+        _hope(fit)
     ended = [fit for fit in fits if _ended(fit)]
     for fit in ended:
         _end(fit, replays)
@@ -102,12 +105,22 @@ def _look_around(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
 
 
 def _end(fit: Fit, replays: Replays) -> None:
-    """End a fit, or let it go on with narrower differences in contact."""
-    if fit.narrow and fit.contact > 1 and replays.measured.grounded.any():
+    """End a fit, or let it go on with closer differences: exact ones, narrower ones in contact."""
+    if fit.thorough and not fit.exact and not fit.near_noise:
+        fit.exact = True
+        fit.jacobian = None
+        _hope(fit)
+    elif fit.narrow and fit.contact > 1 and replays.measured.grounded.any():
         fit.contact = max(fit.contact / NARROWER, 1.0)
-        fit.jacobian, fit.stuck, fit.damping = None, 0, Fit.damping
+        fit.jacobian = None
+        _hope(fit)
     else:
         fit.done = True
+
+
+def _hope(fit: Fit) -> None:
+    """Forget how a fit failed with another Jacobian, which says nothing of a new one."""
+    fit.stuck, fit.damping = 0, min(fit.damping, Fit.damping)
 
 
 def _widen(fit: Fit) -> None:
@@ -120,8 +133,11 @@ def _widen(fit: Fit) -> None:
 
 
 def _ended(fit: Fit) -> bool:
-    """Whether the Jacobian promises no gain that counts."""
-    return fit.promise(_trials(fit)[0]) < fit.least
+    """Whether the Jacobian promises no gain that counts.
+
+    A step that is cut at two walls of its box may promise less than one that is damped more.
+    """
+    return all(fit.promise(at) < fit.least for at in _trials(fit, (*DAMPINGS, *HEAVIER)))
 
 
 def complete(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
@@ -133,11 +149,14 @@ def differentiate(fits: Sequence[Fit], replays: Replays, noise: Noise) -> None:
     """Give some fits fresh Jacobians where they stand."""
     if not fits:
         return
-    asked = [_differences(fit, fit.at) for fit in fits]
-    told = changes([(fit.row(), *d[1]) for fit, d in zip(fits, asked, strict=True)], replays)
-    for fit, (steps, _), changed in zip(fits, asked, told, strict=True):
-        fit.jacobian = _jacobian(steps, changed, replays, noise)
-        fit.age = 0
+    for exact in (False, True):
+        some = [fit for fit in fits if fit.exact is exact]
+        asked = [_differences(fit, fit.at) for fit in some]
+        rows = [(fit.row(), *d[1]) for fit, d in zip(some, asked, strict=True)]
+        told = changes(rows, replays, coarse=not exact) if some else []
+        for fit, (steps, _), changed in zip(some, asked, told, strict=True):
+            fit.jacobian = _jacobian(steps, changed, replays, noise)
+            fit.age = 0
 
 
 def _differences(fit: Fit, at: Array) -> tuple[Array, tuple[Rows, Rows]]:
@@ -210,14 +229,14 @@ def difference(fit: Fit, i: int, at: Array, width: float) -> float:
     return step if at[i] + step <= coordinate.upper else -step
 
 
-def _trials(fit: Fit) -> list[Array]:
+def _trials(fit: Fit, dampings: Sequence[float] = ()) -> list[Array]:
     """Where damped Gauss-Newton steps lead, the least damped first."""
     normal, gradient = fit.normal(), fit.downhill()
     lower = np.array([c.lower for c in fit.coordinates])
     upper = np.array([c.upper for c in fit.coordinates])
     scale = np.maximum(np.diag(normal), 1e-6 * max(float(np.diag(normal).max()), 1e-300))
     points = []
-    for factor in _dampings(fit):
+    for factor in dampings or _dampings(fit):
         system = normal + factor * fit.damping * np.diag(scale)
         points.append(_bounded(system, gradient, fit.at, lower, upper))
     return points
@@ -274,7 +293,7 @@ def _take(fit: Fit, replays: Replays, reached: Sequence[_Reached]) -> None:
         _end(fit, replays)
     else:
         fit.jacobian = None
-        fit.stuck = 0
+        _hope(fit)
 
 
 def _go(fit: Fit, to: _Reached, chi2: float) -> None:

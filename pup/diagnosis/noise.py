@@ -144,7 +144,11 @@ def told_anew(before: Noise, measured: Measured, errors: Array) -> Noise | None:
     unchanged = same & (np.abs(after.rho - before.rho) < SAME_RHO)
     if unchanged.all() or np.mean(astray[seen]) > 0.5:
         return None
-    return replace(after, sigma=np.where(astray, before.sigma, after.sigma))
+    return replace(
+        after,
+        sigma=np.where(astray, before.sigma, after.sigma),
+        rho=np.where(astray, before.rho, after.rho),
+    )
 
 
 def _blocks(measured: Measured, errors: Array, channel: int) -> list[Array]:

@@ -31,9 +31,10 @@ def changes(
     asked: Sequence[Asked],
     replays: Replays,
     recordings: Sequence[int] | None = None,
+    coarse: bool = True,
 ) -> list[Array]:
     """What probes change in the samples; see `probed`. In the air in longer sub-steps."""
-    return [changed for _, changed in probed(asked, replays, recordings, coarse=True)]
+    return [changed for _, changed in probed(asked, replays, recordings, coarse)]
 
 
 def probed(
