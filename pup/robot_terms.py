@@ -33,11 +33,12 @@ def read_terms(
         kinds = [known for known in get_args(PlaceKind) if known == kind]
         if not kinds:
             raise place.mistake("kind", f"{kind!r} is none of {listed(get_args(PlaceKind))}")
-        lacks = {"sensor": "IMU (imu_site)" * (not imu_site), "ground": "feet" * (not feet)}
-        if lacking := lacks.get(kind):
+        if kind == "sensor" and imu_site is None:
             raise place.mistake(
-                "kind", f"the robot has no {lacking}, and the term would do nothing"
+                "kind", "the robot has no IMU (imu_site); the term would do nothing"
             )
+        if kind == "ground" and not feet:
+            raise place.mistake("kind", "the robot has no feet; the term would do nothing")
         name = _name(place, kinds[0], names, model)
         place.close()
         quantities = entry.table("values")
