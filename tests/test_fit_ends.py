@@ -20,7 +20,7 @@ from pup.physics.parameters import robot_space
 def test_a_fit_that_ends_far_from_noise_has_ended() -> None:
     """A servo that is 10 ms late, which no nominal parameter is, from twelve starts far off.
 
-    With slopes that are only nearly right a third of them stop at twice what they go on to.
+    With slopes that are only nearly right a third of them stop at up to twice what they go on to.
     """
     rng = np.random.default_rng(0)
     told = recordings({"actuator_lag/time@joint:servo": 0.01}, seed=4)

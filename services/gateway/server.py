@@ -11,9 +11,10 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
+from fastapi import FastAPI
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
@@ -211,7 +212,7 @@ class _Server(uvicorn.Server):
 
     def stop(self) -> None:
         """Take no more requests, and end streams and what waits for a fit."""
-        state = self.config.app.state  # type: ignore[union-attr]  # it is no name of one
-        state.stopping = True
-        state.conductor.posteriors.stop()
+        app = cast(FastAPI, self.config.app)  # as it was given, not by name
+        app.state.stopping = True
+        app.state.conductor.posteriors.stop()
         self.should_exit = True
