@@ -86,6 +86,13 @@ class Loop(threading.Thread):
         refused = Refused(f"the control loop does not run: {self.status.reason or 'no bus'}")
         return request.wait(2.0, refused)
 
+    def _want(self, act: Callable[[Senses], None]) -> None:
+        """From another thread: have something done between two ticks, however late that is.
+
+        For what is never asked for again: a trial that is told once to run.
+        """
+        self._requests.put(Request(act))
+
     def _happened(self, event: Event) -> None:
         """Keep what an activity tells until its target is sent."""
         self._events.append(event)

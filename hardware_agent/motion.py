@@ -94,7 +94,7 @@ class Motion(Loop):
 
     def go(self, assign: Assign) -> None:
         """The trial that stands ready may run: the journal has it."""
-        self._ask(lambda senses: self._go(assign))
+        self._want(lambda senses: self._go(assign))
 
     def placed(self, assign: Assign, cold: bool = False) -> None:
         """Whoever puts the robot on its feet has done so, or leaves it to the robot.
@@ -103,7 +103,7 @@ class Motion(Loop):
           assign: the trial.
           cold: whether motors are cold now, as only those of a virtual robot can be made.
         """
-        self._ask(lambda senses: self._placed(assign, cold))
+        self._want(lambda senses: self._placed(assign, cold))
 
     def pose(self, script: Script, stopped: Callable[[], bool]) -> Refused | None:
         """Go to a script's first pose.
@@ -125,12 +125,12 @@ class Motion(Loop):
 
     def cancel(self, reason: str) -> None:
         """End the trial that there is, standing."""
-        self._ask(lambda senses: self._cancel(reason))
+        self._want(lambda senses: self._cancel(reason))
 
     def measured(self) -> None:
         """How far the robot came is known: time may go on where it stood still for that."""
         if self.metronome.lockstep:
-            self._ask(lambda senses: None)
+            self._want(lambda senses: None)
 
     def hurry(self, hurried: bool) -> None:
         """Whether something waits for time to pass: lock-step need not keep to the clock then."""

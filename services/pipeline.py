@@ -368,11 +368,13 @@ class _Job:
 
 
 def _step_back() -> None:
-    """Have a thread, and those that it starts, take what others leave of the cores.
+    """Have a thread, and those that it starts, leave most of the cores to others.
 
     A trial is a chain of short steps of several processes, each of which would wait for a picture.
+    Not the lowest priority: on a busy machine that comes to no time at all, and what this thread
+    holds meanwhile (Python's lock, a module half imported) the trials wait for.
     """
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
 
 
 def _half(generations: int) -> int:

@@ -1,5 +1,7 @@
 """A `pup` that runs in a process group of its own, to be stopped and killed."""
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +15,8 @@ import psutil
 from workers import reaper
 
 PATIENCE = 600.0
+END = 540.0
+"""For a job to end, s: less than pytest has for a test, so that a job that hangs is told of."""
 
 
 def until(true: Callable[[], Any], patience: float = PATIENCE) -> None:
@@ -38,6 +42,7 @@ class Job:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            env=os.environ | {"PYTHONFAULTHANDLER": "1"},
         )
         self.ray: str | None = None
 
@@ -65,9 +70,19 @@ class Job:
         assert self.process.poll() is None, self.process.communicate()
         self.started_ray()
 
-    def end(self, patience: float = PATIENCE) -> tuple[int, str, str]:
-        """Wait for its end: the exit code, standard output and standard error."""
-        out, err = self.process.communicate(timeout=patience)
+    def end(self, patience: float = END) -> tuple[int, str, str]:
+        """Wait for its end: the exit code, standard output and standard error.
+
+        Raises:
+          AssertionError: it hangs; says where, and what it and its processes have told.
+        """
+        try:
+            out, err = self.process.communicate(timeout=patience)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)  # by which it tells where its threads are
+            _, err = self.process.communicate()
+            logs = [f"{file}:\n{file.read_text()[-2000:]}" for file in self.out.rglob("*.log")]
+            raise AssertionError("\n".join([f"hangs: {err[-6000:]}", *logs])) from None
         return self.process.returncode, out, err
 
     def left(self) -> list[str]:

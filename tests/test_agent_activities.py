@@ -1,16 +1,19 @@
 """When a robot is on its own feet, so that a large tilt is a fall."""
 
 import copy
+import threading
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from agents import DARWIN, bundle, standing
+from agents import CONFIG, DARWIN, bundle, standing, wait
 
 from hardware_agent.activities import WATCHED, Activity, Event, Hold, Settle, Walk
-from hardware_agent.config import ControlSettings, ImuSettings
+from hardware_agent.body import Body
+from hardware_agent.config import ControlSettings, ImuSettings, Settings
 from hardware_agent.imu import IMU_MODE, MODE, Bno055, Orientation
+from hardware_agent.motion import Motion
 from hardware_agent.policies import Shelf
 from hardware_agent.recordings import Recordings
 from hardware_agent.rollout import Rollout, row_names
@@ -157,3 +160,31 @@ def test_it_is_from_when_it_stands_ready_until_it_is_taken(rollout: Rollout) -> 
     ]
     assert phases.count(("Ramp", True)) == pytest.approx((0.5 + WATCHED) / PERIOD, abs=4)
     assert isinstance(doing, Hold) and not isinstance(doing, Walk)
+
+
+def test_a_trial_that_may_run_runs_however_long_the_loop_was_held_up(
+    rollout: Rollout, tmp_path: Path
+) -> None:
+    """It is told so once; a robot that never heard of it would stand for good."""
+    held = threading.Event()
+
+    class HeldUp(Motion):
+        def _tick(self, now: float) -> None:
+            held.wait()
+            self._serve(senses(now, rollout.pose))
+
+    (tmp_path / "agent.toml").write_text(CONFIG.format(folder=tmp_path, protocol=1, clock="wall"))
+    body = Body(Settings.read(tmp_path / "agent.toml"), DARWIN)
+    motion = HeldUp(body, None, lambda event: None)
+    assign = Assign("study", "t", 1, 1, "0" * 64, (0.0, 0.0, 0.0), 1.0)
+    settle = Settle(assign, rollout, None, ControlSettings(), lambda event: None)
+    motion._become(settle)
+    motion.start()
+    motion.placed(assign)
+    motion.go(assign)
+    refused = motion.disable()  # whoever waits for an answer is told that there is none
+    assert refused is not None
+    held.set()
+    wait(lambda: settle.go, 10)
+    motion.close()
+    assert settle.placed and motion.state is settle.state
