@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import write_atomic
-from pup.recording_file import KEY, read_columns, visible
+from pup.recording_file import KEY, check_footer, read_columns, visible
 from pup.recording_rules import (
     SCHEMA,
     check_extra,
@@ -180,11 +180,19 @@ class Recording:
             raise InputError(f"recording {self.id!r}: {error}") from error
 
     def write(self, path: Path) -> None:
-        """Write the recording as Parquet, whole or not at all."""
+        """Write the recording as Parquet, whole or not at all.
+
+        Raises:
+          InputError: it is larger than what `read` takes.
+        """
         columns = {name: _nullable(values) for name, values in self.columns()}
         table = pa.table(columns).replace_schema_metadata({KEY: json.dumps(self.metadata())})
         buffer = io.BytesIO()
         pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
+        try:
+            check_footer(pq.ParquetFile(buffer))
+        except InputError as error:
+            raise InputError(f"recording {self.id!r}: {error}") from error
         write_atomic(path, buffer.getvalue())
 
     @classmethod
@@ -333,7 +341,15 @@ def write_recordings(recordings: Sequence[Recording], folder: Path) -> tuple[Pat
 
     Returns:
       The files, in the order of the recordings.
+
+    Raises:
+      InputError: an id stands twice, as of two cuts that begin together.
     """
+    seen: set[str] = set()
+    for recording in recordings:
+        if recording.id in seen:
+            raise InputError(f"two recordings have the id {recording.id!r}; each needs its own")
+        seen.add(recording.id)
     folder.mkdir(parents=True, exist_ok=True)
     files = tuple(folder / f"{recording.id}.parquet" for recording in recordings)
     with TemporaryDirectory(dir=folder, prefix=".new-") as new:

@@ -50,7 +50,7 @@ def cut(recording: Recording, start: float, stop: float, id: str = "") -> Record
 def beginning(recording: Recording, until: float) -> Recording:
     """The recording up to some time after its start, s; two rows of it at least."""
     last = max(FEWEST, int(np.sum(recording.time - recording.time[0] < until)))
-    return _rows(recording, np.arange(len(recording.time)) < last)
+    return _rows(_with_power(recording), np.arange(len(recording.time)) < last)
 
 
 def _rows(recording: Recording, kept: NDArray[np.bool_]) -> Recording:
@@ -66,10 +66,20 @@ def _rows(recording: Recording, kept: NDArray[np.bool_]) -> Recording:
 
 def with_commands(recording: Recording) -> Recording:
     """The recording with the commands that each row holds; before the first one there is none."""
-    extras = dict(recording.extras)
-    if "torque_enabled" in extras:
-        extras["torque_enabled"] = _held(extras["torque_enabled"])
-    return replace(recording, target=_held(recording.target), extras=extras)
+    return replace(_with_power(recording), target=_held(recording.target))
+
+
+def _with_power(recording: Recording) -> Recording:
+    """The recording with the torque on or off in each row, so that no part of it has no sample.
+
+    Rows before the first sample have its value, as in a replay.
+    """
+    power = recording.extras.get("torque_enabled")
+    if power is None:
+        return recording
+    power = _held(power)
+    power[np.isnan(power)] = power[~np.isnan(power)][0]
+    return replace(recording, extras={**recording.extras, "torque_enabled": power})
 
 
 def _held(values: Array) -> Array:

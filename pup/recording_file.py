@@ -118,7 +118,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         # Opened here, as pyarrow knows no path whose name is not UTF-8.
         with path.open("rb") as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
-            _check_footer(file)
+            check_footer(file)
             yield file
     except InputError:
         raise
@@ -141,7 +141,15 @@ def _values(table: Any, name: str) -> Array:
     return values
 
 
-def _check_footer(file: Any) -> None:
+def check_footer(file: Any) -> None:
+    """Judge a file by what its footer tells, before any data is read.
+
+    Args:
+      file: a `pyarrow.parquet.ParquetFile`.
+
+    Raises:
+      InputError: it is too large, or no recording.
+    """
     footer, schema = file.metadata, file.schema_arrow
     unpacked = sum(footer.row_group(i).total_byte_size for i in range(footer.num_row_groups))
     rows, columns = footer.num_rows, footer.num_columns

@@ -32,6 +32,9 @@ times the larger one, and so much more, rad; degrees and encoder ticks are."""
 TILTS = {"imu/roll": 2 * math.pi, "imu/pitch": math.pi / 2 + 0.1}
 """Largest angles of the torso, rad: the pitch of Z-Y-X Euler angles ends at a quarter of a turn;
 the roll ends at a half, and may be unwrapped."""
+JUMP, FASTEST = math.pi, 50.0
+"""A joint whose readings differ by more than half a turn, and by more rad/s than a servo turns by,
+has an encoder that begins anew after a turn."""
 MOVING, FASTER = 0.1, 6.0
 """A joint that moves by more, rad/s rms, tells the unit of its velocity: deg/s are 57 times what
 its positions change by, rpm 9.5 times. One that rattles between readings may be far above 1."""
@@ -62,7 +65,20 @@ def check_metadata(metadata: object) -> dict[str, Any]:
         raise InputError(f"metadata 'repeat_of' is {repeated!r}; use an id or null")
     if not isinstance(metadata.get("notes", ""), str):
         raise InputError("metadata 'notes' is not a text")
+    for key in ("robot", "motion", "repeat_of", "notes"):
+        _check_encodable(key, metadata.get(key) or "")
     return metadata
+
+
+def _check_encodable(key: str, text: str) -> None:
+    """Refuse halves of characters, which JSON can hold but no page, report or terminal."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        broken = text[error.start : error.end]
+        raise InputError(
+            f"metadata {key!r} holds {broken!r}, which is no character of UTF-8"
+        ) from error
 
 
 def check_id(name: str) -> None:
@@ -153,6 +169,7 @@ def check_units(joints: Sequence[Joint], columns: Mapping[str, Array]) -> None:
                     f"to [{joint.lower:g}, {joint.upper:g}]; are these degrees, encoder ticks or "
                     "mm?"
                 )
+    _check_turns([joint.name for joint in joints], columns)
     _check_velocities([joint.name for joint in joints], columns)
     for name, largest in TILTS.items():
         values = columns.get(name, np.zeros(0))
@@ -160,6 +177,19 @@ def check_units(joints: Sequence[Joint], columns: Mapping[str, Array]) -> None:
             raise InputError(
                 f"column {name!r}, row {row}: {values[row]:g}, beyond {largest:.3g} rad; are these "
                 "degrees?"
+            )
+
+
+def _check_turns(joints: Sequence[str], columns: Mapping[str, Array]) -> None:
+    """Refuse angles that jump from one end of their encoder's turn to the other."""
+    for name in (f"position/{joint}" for joint in joints):
+        read = np.flatnonzero(~np.isnan(columns[name]))
+        angle, time = columns[name][read], columns["time"][read]
+        jump, gap = np.abs(np.diff(angle)), np.diff(time)
+        for i in np.flatnonzero((jump > JUMP) & (jump > FASTEST * gap)):
+            raise InputError(
+                f"column {name!r}, row {read[i + 1]}: {angle[i + 1]:.3g}, but {angle[i]:.3g} only "
+                f"{gap[i]:.3g} s before; does its encoder begin anew after a turn? unwrap it"
             )
 
 
@@ -192,6 +222,7 @@ def _check_setup(setup: object) -> None:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not isinstance(knob, str) or not number or not _is_finite(value):
             raise InputError(f"metadata 'setup': {knob!r} is {value!r}; use a finite number")
+        _check_encodable("setup", knob)
 
 
 def _is_finite(value: float) -> bool:

@@ -209,12 +209,13 @@ def folder_of(shared: Path, job: str) -> JobFolder:
 
 
 def below(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Files by name, sorted; links are none, nor are files that are being written."""
+    """Files by name, sorted; links are none, nor are files being written or in locked folders."""
     for place, folders, files in os.walk(folder):
         folders.sort()
         for name in sorted(files):
             path = Path(place) / name
-            if not name.startswith(".") and path.is_file() and not path.is_symlink():
+            # Unlike `Path.is_file`, this is False and no error in a folder that may not be entered.
+            if not name.startswith(".") and os.path.isfile(path) and not path.is_symlink():
                 yield path.relative_to(folder).as_posix(), path
 
 

@@ -10,6 +10,7 @@ from pup.errors import InputError
 from pup.recording import Recording, originals
 from pup.robot import Actuator
 from pup.sysid.fit import FitResult
+from pup.sysid.loss import ReplayLoss, Terms
 from pup.sysid.problem import Problem
 
 Array = NDArray[np.float64]
@@ -47,7 +48,10 @@ def held_out(
     fits: Mapping[tuple[Actuator, int], tuple[Problem, FitResult]],
     main: Actuator,
 ) -> dict[str, float]:
-    """Pooled loss and root mean square error of the recordings that each fold left out.
+    """Equation 1 and root mean square error of all recordings, each by the fit that left it out.
+
+    Each term of equation 1 is a mean over the recordings that have it. A mean of the folds' own
+    losses would be another: a fold may leave out none that tilts.
 
     Args:
       recordings: all of them.
@@ -55,17 +59,20 @@ def held_out(
       fits: of each torque law and fold.
       main: the torque law whose measures bear no name.
     """
+    left_out = [tuple(r for i, r in enumerate(recordings) if i not in kept) for kept in folds]
+    robot = next(iter(fits.values()))[0].robot
+    whole = ReplayLoss(robot, [recording for left in left_out for recording in left])
     measures: dict[str, float] = {}
     for actuator in dict.fromkeys(actuator for actuator, _ in fits):
-        errors, losses = [], []
-        for k, kept in enumerate(folds):
+        errors, terms = [], []
+        for k, left in enumerate(left_out):
             problem, result = fits[actuator, k]
-            left = tuple(r for i, r in enumerate(recordings) if i not in kept)
-            problem, best = replace(problem, recordings=left), result.best[None]
-            errors.append(problem.loss.rmse(problem.replay(best))[0])
-            losses.append(problem.losses(best)[0])
+            problem = replace(problem, recordings=left)
+            replayed = problem.replay(result.best[None])
+            errors.append(problem.loss.rmse(replayed)[0])
+            terms.append(problem.loss.terms(replayed))
         suffix = "" if actuator == main else f"_{actuator}"
-        measures["loss" + suffix] = float(np.mean(losses))
+        measures["loss" + suffix] = float(whole.total(Terms.joined(terms, axis=1))[0])
         measures["rmse" + suffix] = pooled_rmse(np.concatenate(errors))
     return measures | {"folds": len(folds)}
 

@@ -26,6 +26,14 @@ SPACE = ParameterSpace(
 )
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.3, 0.9), (-0.1, 0.3)])
+def test_the_end_of_a_range_is_within_it(low: float, high: float) -> None:
+    """A last bit beyond, a fit that stopped there would be refused as the start of another."""
+    assert low + (high - low) > high
+    space = ParameterSpace(("kp",), ("1",), *map(np.atleast_1d, (low, low, high)))
+    assert space.denormalise(np.array([[0.0], [1.0]])).ravel().tolist() == [low, high]
+
+
 def half_and_half(n: int) -> list[bool]:
     return [i < n // 2 for i in range(n)]
 

@@ -99,9 +99,9 @@ def test_bam_repeated_timestamps_go_with_a_note_and_backward_ones_are_refused(
     recording = one("bam", path)
     assert len(recording.time) == 4
     assert "1 rows that repeat a timestamp left out" in recording.notes
-    log["entries"][3]["timestamp"] = 0.001
+    log["entries"][4]["timestamp"] = 0.001
     path.write_text(json.dumps(log))
-    with pytest.raises(InputError, match="'time', row 3"):
+    with pytest.raises(InputError, match="'timestamp', row 4: is before"):
         one("bam", path)
 
 

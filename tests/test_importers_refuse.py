@@ -31,6 +31,7 @@ from mcap.writer import CompressionType
 
 from pup.errors import InputError
 from pup.importers import FORMATS, ImportOptions, import_recordings, mcap_format, npz
+from pup.importers.common import join
 from pup.recording import Recording
 
 DARWIN_WRONG: list[tuple[dict[str, Any], str]] = [
@@ -232,6 +233,7 @@ def test_mcap_bombs_are_refused(
         ([], "topics none"),
         ([3], "message 0: not a JSON object"),
         ([{"time": "now"}], "'time' is not made of numbers"),
+        ([*ROWS, {"time": 0.2, "position/a": float("nan")}], "'position/a', row 3: nan"),
         ([ROWS[0], ROWS[0]], "'time', row 1"),
         ([{**row, "colour": 1} for row in ROWS], "'colour'"),
     ],
@@ -251,6 +253,18 @@ def test_mcap_tells_what_is_missing_for_commands(tmp_path: Path) -> None:
     told = r"log\.mcap: the last reading is 3599\.91 s before the first command.* of one clock\?"
     with pytest.raises(InputError, match=told):
         one("mcap", path, ARM)
+    path = write_ros(tmp_path / "log.mcap", commands=-3600.0)
+    told = r"log\.mcap: the last command is 3599\.93 s before the first reading.* of one clock\?"
+    with pytest.raises(InputError, match=told):
+        one("mcap", path, ARM)
+
+
+def test_one_command_before_all_readings_is_held() -> None:
+    columns, note = join(
+        np.array([1.0]), np.array([3.0, 3.5]), {"c": np.array([7.0])}, {"s": np.array([1.0, 2.0])}
+    )
+    assert columns["time"].tolist() == [0.0, 2.0, 2.5]
+    assert columns["c"].tolist() == [7.0] * 3 and not note
 
 
 def test_joints_of_an_archive_are_named_once_and_may_stand_apart(tmp_path: Path) -> None:
@@ -344,3 +358,9 @@ def test_damaged_logs_are_refused_or_read_and_nothing_else(
         assert "\n" not in str(error)
     else:
         assert all(np.isfinite(recording.time).all() for recording in recordings)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_device_that_never_ends_is_not_read(format: str) -> None:
+    with pytest.raises(InputError, match="/dev/zero: not a file"):
+        import_recordings(format, [Path("/dev/zero")])

@@ -2,7 +2,9 @@
 
 import json
 import math
+import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 pytest.importorskip("fastapi")
 
 from pup.errors import InputError
-from services.gateway import artefacts, charts
+from services.gateway import artefacts, charts, drawing
 from services.gateway.documents import BoundsDocument, DiagnosisDocument, TrainingDocument
 from services.gateway.recordings import Shelves
 from services.job_folder import folder_of, inside
@@ -66,6 +68,20 @@ def test_gaps_are_gaps_and_sparse_samples_are_joined() -> None:
     assert position.count('class="position"') == 2 and position.count('class="command"') == 1
     assert current.count('class="current"') == 1
     assert "nan" not in position + current
+
+
+def test_a_command_is_drawn_as_long_as_it_holds() -> None:
+    """Logs may tell commands only where they change; the last one holds to the end."""
+    told = stored_findings.currents()
+    target = np.full_like(told.target, np.nan)
+    target[[0, 1, 2, 500]] = [[0.0], [0.1], [0.2], [0.4]]
+    (picture, _) = charts.joint(replace(told, target=target), 0)
+    (line,) = re.findall(r'class="command" points="([^"]+)"', picture)
+    x, y = np.array([[float(v) for v in p.split(",")] for p in line.split()]).T
+    right = charts.WIDTH - drawing.RIGHT
+    assert (x[0], x[-1]) == (drawing.LEFT, right) and y[-1] == y.min()
+    flat = np.diff(x) > 0
+    assert (np.diff(y)[flat] == 0).all() and (np.diff(x)[~flat] == 0).all()
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=5, max_size=5))
@@ -187,6 +203,31 @@ def test_recordings_are_listed_with_what_is_wrong_with_them(tmp_path: Path) -> N
     assert str(tmp_path) not in listed[0].trouble
     header = listed[1].header
     assert header and header.joints == ("servo",) and header.rate == pytest.approx(100)
+
+
+def test_a_file_s_name_that_no_page_can_hold_does_not_hide_the_others(tmp_path: Path) -> None:
+    stored_findings.currents().write(tmp_path / "currents.parquet")
+    (tmp_path / os.fsdecode(b"gr\xf6\xdfe.parquet")).write_bytes(b"PAR1")
+    first, second = Shelves({"lab": tmp_path}).listed("lab")[0]
+    assert first.header and second.trouble == "its name is not UTF-8; rename it"
+    assert second.name.encode().decode() == "gr\ufffd\ufffde.parquet"
+
+
+def test_a_folder_that_may_be_read_and_not_entered_does_not_hide_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored_findings.currents().write(tmp_path / "currents.parquet")
+    shut = tmp_path / "shut"
+    stored_findings.currents().write(shut / "more.parquet")
+    real = os.stat
+
+    def stat(path: Any, *args: Any, **options: Any) -> os.stat_result:
+        if str(path).startswith(f"{shut}/"):  # to root, who runs some tests, nothing is shut
+            raise PermissionError(13, "Permission denied")
+        return real(path, *args, **options)
+
+    monkeypatch.setattr(os, "stat", stat)
+    assert [r.name for r in Shelves({"lab": tmp_path}).listed("lab")[0]] == ["currents.parquet"]
 
 
 def test_a_recording_that_is_too_large_is_not_drawn(

@@ -83,6 +83,25 @@ def test_a_fold_fits_what_its_recordings_can_see(robot: RobotDescription, tmp_pa
     assert np.isfinite([held_out["loss"], held_out["rmse"]]).all()
 
 
+def test_the_left_out_loss_is_equation_1_over_all(robot: RobotDescription, tmp_path: Path) -> None:
+    """Where no fold's fit moves, it is the loss of the fit of all: one fold has feet, one has none.
+
+    So do not the means of the folds' own losses, whose recordings are of two numbers besides.
+    """
+    tilt = {"imu/roll": np.zeros(TICKS), "imu/pitch": np.linspace(0, 0.2, TICKS)}
+    recordings = (
+        stepped("air", "suspended"),
+        stepped("floor", "ground", extras=tilt),
+        stepped("more_air", "suspended"),
+    )
+    job, runner = job_of(robot, recordings, tmp_path, Options("pd", folds=2, compare=False))
+    _, held_out = job._nominal()
+    whole = runner.fits["nominal_pd"]
+    assert held_out is not None
+    expected = whole.problem.losses(whole.settings.start[None])[0]
+    assert held_out["loss"] == pytest.approx(expected, rel=1e-9)
+
+
 def test_repeats_are_no_units_of_folds(robot: RobotDescription, tmp_path: Path) -> None:
     """Four recordings of one motion, of which two repeat the others: two folds, and no more."""
     every = tuple(
@@ -93,6 +112,19 @@ def test_repeats_are_no_units_of_folds(robot: RobotDescription, tmp_path: Path) 
     assert kept_in_folds(every, 2) == [(2, 3), (0, 1)]
     with pytest.raises(InputError, match="3 folds for 2 recordings that repeat no other"):
         job_of(robot, every, tmp_path, Options("pd", folds=3))
+
+
+def test_a_robot_described_without_feet_stands_too(robot: RobotDescription, tmp_path: Path) -> None:
+    """Feet are optional: what it stands on is in no term of equation 1 then."""
+    footless = replace(robot, feet=())
+    recordings = (stepped("air", "suspended"), stepped("floor", "ground"))
+    job, _ = job_of(footless, recordings, tmp_path, Options("pd", compare=False))
+    problem = job._problem("pd")
+    unit = np.full((2, len(problem.free)), 0.5)
+    errors, blocks = problem.errors(unit)
+    norms = np.sqrt(np.add.reduceat(errors**2, blocks, axis=1))
+    np.testing.assert_allclose(norms.sum(axis=1), problem.losses(unit), rtol=1e-12)
+    assert "the robot is described without feet: foot term left out" in problem.loss.omitted()
 
 
 def unread(id_: str) -> Recording:
@@ -297,7 +329,8 @@ def test_a_start_that_tells_no_recordings_may_have_seen_them_all(
 ) -> None:
     file = start(robot, tmp_path, ())
     assert fitted_to(file) == frozenset()
-    for provenance in ({}, [], {"recordings": []}):
+    after_another = {"recordings": {"a": "its digest"}, "options": {"start": "of whatever"}}
+    for provenance in ({}, [], {"recordings": []}, after_another):
         write_json(file, {"provenance": provenance})
         assert fitted_to(file) is None
 

@@ -15,7 +15,8 @@ from hypothesis.extra import numpy as hnp
 from recordings import COLUMNS, make, write_table
 
 from pup.errors import InputError
-from pup.recording import Recording, load_recordings
+from pup.recording import Recording, load_recordings, write_recordings
+from pup.recording_cuts import cut
 from pup.recording_file import read_header
 from pup.robot import RobotDescription
 
@@ -172,6 +173,14 @@ def test_refuses_sets_that_are_empty_or_name_an_id_twice(tmp_path: Path) -> None
         load_recordings([tmp_path])
 
 
+def test_no_recording_takes_the_place_of_another_of_its_id(tmp_path: Path) -> None:
+    """Two cuts that begin together are called alike."""
+    whole = make(time=np.arange(3.0))
+    with pytest.raises(InputError, match="two recordings have the id 'r1_0s'"):
+        write_recordings([cut(whole, 0, 2), cut(whole, 0, 3)], tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_hidden_files_are_no_recordings(tmp_path: Path) -> None:
     """A write that was killed leaves `.new-...`, and macOS a `._r1.parquet` beside each file."""
     make().write(tmp_path / "r1.parquet")
@@ -238,6 +247,19 @@ def test_validate_refuses_other_units_and_lets_a_robot_fall() -> None:
             far.validate(robot)
     with pytest.raises(InputError, match=r"'r1': column 'time': rows are 30 s apart; .* in ms"):
         dataclasses.replace(SERVO, time=[0.0, 30.0, 60.0]).validate(robot)
+
+
+def test_validate_refuses_angles_that_begin_anew_after_a_turn() -> None:
+    """A servo that passes the end of its encoder's turn, with a missing sample there."""
+    robot = RobotDescription.load("servo_bench")
+    angles = np.array([3.0, 3.08, np.nan, 3.24, 3.3])
+    time = 0.02 * np.arange(5)
+    told = {"time": time, "target": np.full((5, 1), 3.1)}
+    dataclasses.replace(SERVO, **told, position=angles[:, None]).validate(robot)
+    wrapped = (angles[:, None] + np.pi) % (2 * np.pi) - np.pi
+    said = r"'position/servo', row 3: -3\.04, but 3\.08 only 0\.04 s before; .* unwrap"
+    with pytest.raises(InputError, match=said):
+        dataclasses.replace(SERVO, **told, position=wrapped).validate(robot)
 
 
 @pytest.mark.parametrize(

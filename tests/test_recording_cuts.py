@@ -1,5 +1,6 @@
 """Parts of recordings."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 from recordings import make
 
 from pup.errors import InputError
+from pup.physics.simulator import schedule
 from pup.recording import Recording
-from pup.recording_cuts import cut, thinned
+from pup.recording_cuts import beginning, cut, thinned
 
 WHOLE = Recording(
     id="whole",
@@ -54,6 +56,16 @@ def test_a_stretch_knows_the_commands_that_were_held_when_it_began() -> None:
     assert part.target[:, 0].tolist() == [0, 0, 1, 1, 1]
     assert part.extras["torque_enabled"].tolist() == [0, 0, 0, 1, 1]
     np.testing.assert_array_equal(cut(sparse, 0, 0.15).target[:, 0], [nan, 0])
+
+
+@pytest.mark.parametrize("part", [lambda r: cut(r, 0, 0.25), lambda r: beginning(r, 0.25)])
+def test_a_part_before_the_first_word_on_the_torque_has_it_as_a_replay_does(
+    part: Callable[[Recording], Recording],
+) -> None:
+    nan = np.nan
+    late = replace(WHOLE, extras={"torque_enabled": np.array([nan] * 4 + [0] + [nan] * 4 + [1])})
+    assert part(late).extras["torque_enabled"].tolist() == [0, 0, 0]
+    assert not schedule(late, late.joints, 0.01).power[:50].any()
 
 
 def test_a_stretch_without_rows_is_refused() -> None:

@@ -78,16 +78,18 @@ def test_refuses_a_column_that_stands_twice(tmp_path: Path) -> None:
         Recording.read(tmp_path / "x")
 
 
+HALF = "half \ud800 a character"
+"""JSON can hold it; no page, report or terminal can."""
 REFUSED_METADATA: dict[str, Any] = {
     "schema": [2, 0, None, "1", True, 1.5],
     "id": ["", None, 3, "a/b", "..", ".hidden", "a\\b", "a\nb", "x" * 300],
-    "robot": ["", None, 7],
-    "motion": ["", None, ["step"]],
+    "robot": ["", None, 7, HALF],
+    "motion": ["", None, ["step"], HALF],
     "support": ["table", None, 1, ["bench"]],
     "source": ["dream", None],
-    "setup": [None, [], {"mass": "1"}, {"mass": None}, {"mass": True}, {"mass": 10**400}],
-    "repeat_of": ["", 5],
-    "notes": [None, 5],
+    "setup": [None, [], *({"mass": value} for value in ("1", None, True, 10**400)), {HALF: 1}],
+    "repeat_of": ["", 5, HALF],
+    "notes": [None, 5, HALF],
 }
 
 
@@ -151,6 +153,16 @@ def test_refuses_large_files_and_wide_tables(tmp_path: Path, monkeypatch: Any) -
     monkeypatch.setattr(module, "MAX_METADATA", 10)
     with pytest.raises(InputError, match="metadata"):
         Recording.read(path)
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, monkeypatch: Any) -> None:
+    path = tmp_path / "r.parquet"
+    with pytest.raises(InputError, match=r"'r1': metadata 'pup\.recording' has 1048"):
+        make(notes="x" * module.MAX_METADATA).write(path)
+    monkeypatch.setattr(module, "MAX_CELLS", 14)
+    with pytest.raises(InputError, match="'r1': 3 rows of 5 columns"):
+        make().write(path)
+    assert not path.exists()
 
 
 @pytest.fixture(scope="module")

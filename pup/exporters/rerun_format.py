@@ -62,7 +62,9 @@ def _series(take: Take) -> Iterator[tuple[str, str, Array]]:
 
 def _send(stream: rr.RecordingStream, name: str, source: str, time: Array, values: Array) -> None:
     path = rr.new_entity_path([*name.split("/", 1), source])
-    stream.log(path, rr.SeriesLines(colors=COLOURS[source], names=source), static=True)
+    joined = "StepAfter" if source == "target" else None  # commands are held
+    look = rr.SeriesLines(colors=COLOURS[source], names=source, interpolation_mode=joined)
+    stream.log(path, look, static=True)
     known = ~np.isnan(values)
     stream.send_columns(
         path,

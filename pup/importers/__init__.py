@@ -166,6 +166,8 @@ def _logs(paths: Sequence[Path], pattern: str) -> list[Path]:
     for path in map(Path, paths):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
+        if not path.is_dir() and not path.is_file():  # a pipe or device, which may never end
+            raise InputError(f"{path}: not a file")
         found = _inside(path, pattern) if path.is_dir() else [path]
         if not found:
             inside = [f", but in {folder}; name that" for folder in _below(path, pattern)]

@@ -45,6 +45,8 @@ def read(path: Path, options: ImportOptions) -> list[Recording]:
         "voltage": _volts(_column(entries, "input_volts"), setup["vin"]),
         "torque_enabled": _column(entries, "torque_enable"),
     }
+    for row in np.flatnonzero(np.diff(columns["time"]) < 0) + 1:
+        raise InputError(f"column 'timestamp', row {row}: is before that of the row before")
     kept = np.append(True, np.diff(columns["time"]) != 0)[: len(entries)]
     dropped = int(np.sum(~kept))
     columns = {name: values[kept] for name, values in columns.items()}

@@ -198,6 +198,11 @@ def join(
             f"the last reading is {command_time[0] - state_time[-1]:.9g} s before the first "
             "command, so that none is left; are both of one clock?"
         )
+    if len(command_time) > 1 and command_time[-1] < state_time[0]:
+        raise InputError(
+            f"the last command is {state_time[0] - command_time[-1]:.9g} s before the first "
+            "reading, so that none is seen to be followed; are both of one clock?"
+        )
     time = np.union1d(command_time, state_time[kept])
     if len(time) * (1 + len(commands) + len(states)) > MAX_CELLS:
         raise InputError(f"more than {MAX_CELLS} numbers; cut the log")

@@ -200,9 +200,9 @@ def _table(topic: Topic) -> dict[str, Array]:
     columns = {}
     for name in names:
         values = [message.get(name) for message in rows]
-        present = [row for row, value in enumerate(values) if value is not None]
-        columns[name] = np.full(len(values), np.nan)
-        columns[name][present] = finite([values[row] for row in present], name, (len(present),))
+        known = [0.0 if value is None else value for value in values]
+        missing = np.array([value is None for value in values], bool)
+        columns[name] = np.where(missing, np.nan, finite(known, name, (len(rows),)))
     return columns
 
 

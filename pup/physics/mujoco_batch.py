@@ -345,5 +345,6 @@ class Run:
 
 
 def _write(to: Array, part: slice, event: Event, values: Array) -> None:
-    shaped = values.reshape(len(event.rows), -1, *values.shape[1:])
+    rows = len(event.rows)
+    shaped = values.reshape(rows, len(values) // rows, *values.shape[1:])  # of no feet too
     to[part, event.ticks] = shaped.swapaxes(0, 1)

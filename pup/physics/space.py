@@ -37,8 +37,9 @@ class ParameterSpace:
         return (values - self.lower) / (self.upper - self.lower)
 
     def denormalise(self, unit: Array) -> Array:
-        """Unit cube (..., n_parameters) to physical values."""
-        return self.lower + unit * (self.upper - self.lower)
+        """Unit cube (..., n_parameters) to physical values, none beyond its end by a last bit."""
+        values = self.lower + unit * (self.upper - self.lower)
+        return np.where(unit <= 1.0, np.minimum(values, self.upper), values)
 
     def select(self, names: Sequence[str]) -> "ParameterSpace":
         """The space of some of the parameters, in the order given."""

@@ -43,10 +43,10 @@ class Terms:
     feet: Array
 
     @staticmethod
-    def joined(parts: Sequence["Terms"]) -> "Terms":
-        """Those of some candidates after those of others."""
+    def joined(parts: Sequence["Terms"], axis: int = 0) -> "Terms":
+        """Those of some candidates after those of others, or along axis 1 of some recordings."""
         sums = zip(*((part.position, part.tilt, part.feet) for part in parts), strict=True)
-        return Terms(*map(np.concatenate, sums))
+        return Terms(*(np.concatenate(values, axis) for values in sums))
 
 
 class ReplayLoss:
@@ -68,7 +68,8 @@ class ReplayLoss:
         self.tilt = np.concatenate([_tilt(r) for r in recordings])
         motions = [r.motion for r in recordings]
         ground = np.array([r.support == "ground" for r in recordings])
-        self.standing = ground & np.array([m in STANDING for m in motions])
+        on_feet = [self.feet > 0 and m in STANDING for m in motions]
+        self.standing = ground & np.array(on_feet)
         moving = np.array([m in STANDING | FALLING for m in motions])
         measured = [not np.isnan(self.tilt[part]).all() for part in self.ticks]
         self.tilting = ground & moving & np.array(measured)
@@ -149,6 +150,8 @@ class ReplayLoss:
             )
         if not wanted:
             lines.append("no standing or falling recording: tilt and foot terms left out")
+        elif not self.feet:
+            lines.append("the robot is described without feet: foot term left out")
         elif not self.standing.any():
             lines.append("no standing recording: foot term left out")
         return lines

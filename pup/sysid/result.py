@@ -230,11 +230,16 @@ def read_fitted(path: Path, robot: RobotDescription) -> tuple[Actuator, Paramete
 def fitted_to(path: Path) -> frozenset[str] | None:
     """Digests of the recordings that a bounds file was fitted to; None where it does not tell.
 
+    A fit that began at another's values may have kept some of them, and names its own recordings
+    alone.
+
     Raises:
       InputError: the file is not JSON.
     """
     try:
-        return frozenset(map(str, read_json(path)["provenance"]["recordings"].values()))
+        told = read_json(path)["provenance"]
+        began = "start" in told.get("options", ())
+        return None if began else frozenset(map(str, told["recordings"].values()))
     except (LookupError, TypeError, AttributeError):
         return None
 

@@ -57,16 +57,22 @@ def _runs(x: Array) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(edges)]
 
 
-def _lines(axes: Axes, x: Array, y: Array, kind: str, held: bool = False) -> Iterator[str]:
-    """Samples as lines, missing ones left out; what is held until the next one, as stairs."""
+def _lines(axes: Axes, x: Array, y: Array, kind: str) -> Iterator[str]:
+    """Samples as lines, missing ones left out."""
     there = np.isfinite(y)
     x, y = x[there], _clipped(y[there])
     for run in _runs(x):
         xs, ys = x[run], y[run]
-        if held:
-            xs, ys = np.repeat(xs, 2)[1:], np.repeat(ys, 2)[:-1]
         most = max(4, POINTS * len(xs) // max(1, len(x)))
         yield axes.line(*(a.tolist() for a in thinned(xs, ys, most)), kind)
+
+
+def _stairs(axes: Axes, x: Array, y: Array, kind: str) -> str:
+    """Samples that are held until the next one, however late, and the last one to the end."""
+    there = np.isfinite(y)
+    xs = np.append(np.repeat(x[there], 2)[1:], x[-1])
+    ys = np.repeat(_clipped(y[there]), 2)
+    return axes.line(*(a.tolist() for a in thinned(xs, ys)), kind)
 
 
 def _clipped(values: Array) -> Array:
@@ -89,7 +95,7 @@ def joint(recording: Recording, j: int) -> list[str]:
     axes = Axes(_ends(time), _span(target, position), WIDTH)
     seconds = ticks(*_ends(time))
     drawn = axes.frame("time, s", "position", seconds)
-    drawn += _lines(axes, time, target, "command", held=True)
+    drawn.append(_stairs(axes, time, target, "command"))
     drawn += _lines(axes, time, position, "position")
     told = [svg(WIDTH, f"command and position of {name}", drawn)]
     current = recording.extras.get(f"current/{name}")

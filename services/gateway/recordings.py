@@ -1,6 +1,7 @@
 """Recordings that pages show: folders of Parquet files, looked through within limits."""
 
 import asyncio
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -82,6 +83,9 @@ class Shelves:
 
 
 def _listed(name: str, path: Path) -> Listed:
+    shown = os.fsencode(name).decode(errors="replace")
+    if shown != name:  # no page can hold the name itself
+        return Listed(shown, trouble="its name is not UTF-8; rename it")
     try:
         status = path.stat()
         return Listed(name, _header(path, status.st_mtime_ns, status.st_size))
