@@ -20,7 +20,7 @@ from pup.usage import Usage
 
 DONE, FAILED, REFUSED = 0, 1, 2
 PLACE = "/etc/pup-agent/agent.toml"
-SCRIPTS = "file of `pup record --scripts`, or a folder of them"
+SCRIPTS = "file of `pup record --scripts`, or a folder of them, played in the order of their names"
 SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
 

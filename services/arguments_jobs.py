@@ -57,7 +57,7 @@ def jobs(verb: argparse.ArgumentParser) -> None:
         if name == "logs":
             action.add_argument("--follow", action="store_true", help="until the job has ended")
         if name == "fetch":
-            action.add_argument("names", nargs="*", metavar="NAME", help="default: all")
+            action.add_argument("names", nargs="*", default=[], metavar="NAME", help="default: all")
             out(action, "the artefacts")
         service(action)
         action.add_argument(

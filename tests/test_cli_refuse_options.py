@@ -244,6 +244,10 @@ def _(place: Place) -> Made:
     return place.replay(place.bench)[:-2], ("--out",)
 
 
+def test_what_may_be_left_out_is_not_asked_for(place: Place) -> None:
+    assert_refused(pup("jobs", "fetch", "--out", place.out), "required: JOB;")
+
+
 # --- Places to write to ---------------------------------------------------------------------------
 
 
