@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnoses import Maker
 from matplotlib.colors import to_rgb
@@ -225,6 +226,22 @@ def test_motions_that_come_late_are_admitted(bench: Maker, tmp_path: Path) -> No
     noise = replace(diagnosis.noise, late=0.012)
     diagnosis = replace(diagnosis, nominal=replace(diagnosis.nominal, noise=noise))
     assert "a motion comes earlier or later by ±12 ms" in page(diagnosis, tmp_path).text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_a_met_stop_hides_is_told_where_nothing_was_found(tmp_path: Path) -> None:
+    """A torque that falls with speed may show in the swing back from a drop, and nowhere else."""
+    calm = Maker(RobotDescription.load("darwin_leg"), most=30).nothing()
+    assert not document(calm, "corrected")["reason"]
+    first, *rest = calm.measured.recordings
+    position = first.position.copy()
+    position[:, first.joints.index("l_knee")] = np.where(np.arange(120) < 90, -0.5, 0.5)
+    measured = replace(calm.measured, recordings=(replace(first, position=position), *rest))
+    fell = replace(calm, measured=measured)
+    told = f"not judged, as a joint met its stop: 0.3 s after that in {first.id}"
+    assert document(fell, "corrected")["reason"] == told
+    assert f"which is not judged: one did in {first.id}." in page(fell, tmp_path).text
+    assert "met its stop" not in page(calm, tmp_path).text
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from pup.diagnosis.held_out import HeldOut
+from pup.diagnosis.knocks import SHAKEN
 from pup.diagnosis.laws import contract_name
 from pup.diagnosis.regimes import Window
 from pup.diagnosis.result import Diagnosis
@@ -39,7 +40,9 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
         "robot": robot.name,
         "position_unit": position,
         "verdict": diagnosis.verdict,
-        "reason": "; ".join(filter(None, (diagnosis.reason, _lost(diagnosis)))),
+        "reason": "; ".join(
+            filter(None, (diagnosis.reason, _lost(diagnosis), _unjudged(diagnosis)))
+        ),
         "converged": certificate.holds,
         "noise_floor": {
             "rms": float(np.sqrt(np.mean(noise.sigma[:joints] ** 2))),
@@ -63,6 +66,14 @@ def _lost(diagnosis: Diagnosis) -> str:
     if not diagnosis.lost:
         return ""
     return f"left out, as nothing found in the others explains them: {', '.join(diagnosis.lost)}"
+
+
+def _unjudged(diagnosis: Diagnosis) -> str:
+    """What was not looked at, where nothing was found in the rest: it may show an effect alone."""
+    if diagnosis.verdict != "none" or not diagnosis.unjudged:
+        return ""
+    told = ", ".join(diagnosis.unjudged)
+    return f"not judged, as a joint met its stop: {SHAKEN:g} s after that in {told}"
 
 
 def _finding(finding: Finding, diagnosis: Diagnosis, units: Mapping[str, str]) -> dict[str, Any]:

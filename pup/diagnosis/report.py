@@ -19,6 +19,7 @@ from pup.diagnosis import (
     summary,
 )
 from pup.diagnosis.drawing import draw_robot
+from pup.diagnosis.knocks import SHAKEN
 from pup.diagnosis.laws import NAMELESS, WORDS
 from pup.diagnosis.report_findings import badge, otherwise
 from pup.diagnosis.result import Diagnosis
@@ -222,6 +223,11 @@ class _Report:
                 "fit."
             )
         yield "An effect that these motions do not excite may still be missing."
+        if diagnosis.unjudged:
+            yield (
+                f"So may one that shows only within {SHAKEN:g} s after a joint met its stop, which "
+                f"is not judged: one did in {listed(diagnosis.unjudged)}."
+            )
         if self.left() > LEFT:
             yield (
                 "But what is left is too much for noise: its cause is none of the effects "

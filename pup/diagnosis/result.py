@@ -8,6 +8,7 @@ from pup.diagnosis.evidence import Trace
 from pup.diagnosis.experiment import NextRecording
 from pup.diagnosis.held_out import HeldOut
 from pup.diagnosis.hypotheses import Hypothesis
+from pup.diagnosis.knocks import knocked
 from pup.diagnosis.locate import MissingInput
 from pup.diagnosis.models import Model, Round
 from pup.diagnosis.nominal import Nominal
@@ -68,6 +69,12 @@ class Diagnosis:
     origins: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
     lost: tuple[str, ...] = ()
+
+    @property
+    def unjudged(self) -> tuple[str, ...]:
+        """Recordings in which a joint met its stop: what follows that was not looked at."""
+        ids = (r.id for r in self.measured.recordings if knocked(self.robot, r).any())
+        return tuple(dict.fromkeys(self.origins.get(id, (id, 0.0))[0] for id in ids))
 
     @property
     def noise(self) -> Noise:
