@@ -171,9 +171,10 @@ def test_same_bytes_and_settings_left_alone(tmp_path: Path) -> None:
 
 
 def test_hostile_text_stays_text(tmp_path: Path) -> None:
-    evil = "</style><script>alert(1)</script><img src=http://x onerror='a()'>\x00\u202e & \ud800"
+    markup = "</style><script>alert(1)</script><img src=http://x onerror='a()'>\x00\u202e & "
+    evil = markup + "\ud800"  # which recordings refuse
     recordings = (
-        make_recording(DARWIN, 'a<b>&"$x^$', notes=evil, motion=evil),
+        make_recording(DARWIN, 'a<b>&"$x^$', notes=markup, motion=markup),
         make_recording(DARWIN, "$x_{$'", support="ground", motion="stand"),
     )
     bounds = replace(
