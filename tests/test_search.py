@@ -7,19 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pup.diagnosis.coordinates import nominal_coordinate
+from pup.diagnosis.coordinates import nominal_coordinate, term_coordinate
 from pup.diagnosis.document import document
 from pup.diagnosis.engine import diagnose
 from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
 from pup.diagnosis.looks import followed, followed_well, in_the_air
 from pup.diagnosis.noise import assumed_noise
-from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal
+from pup.diagnosis.nominal import Certificate, Nominal, certified, fit_nominal, free_names
 from pup.diagnosis.pieces import SHORTEST, STILL, origins, pieces
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.search import search
+from pup.diagnosis.search import carried, search
 from pup.physics.parameters import robot_space
 from pup.physics.terms import CLASS_OF
+from pup.physics.terms.scale import Scale
 from pup.recording import Recording
 from tests.blind_sets import ENOUGH, FRICTION, shortened
 from tests.diagnosis_cases import BENCH, recordings
@@ -202,3 +204,30 @@ def test_where_nothing_more_is_looked_for_a_first_look_is_not_scored_again() -> 
         assert done.enough == pytest.approx(first.enough, rel=0.3)
         spent.append(replays.simulated - begun)
     assert spent[0] < spent[1] / 2
+
+
+def test_what_a_first_look_found_is_not_lost_on_the_way_to_all_motions() -> None:
+    """A late loop with little damping swings, and from a little off its fit gets out of step."""
+    late = "command_delay/time@joint:servo"
+    truth = {late: 0.008, "kd/servo": 0.03}
+    measured = Measured.of(BENCH, recordings(truth))
+    space = robot_space(BENCH, "pd")
+    replays = Replays(measured, space, threads(Bench(measured), 1), 1)
+    noise, values = assumed_noise(measured), dict(zip(space.names, space.nominal, strict=True))
+    own = tuple(nominal_coordinate(space, name) for name in free_names(space, ground=False))
+    free = (*own, term_coordinate(late, Scale.of(BENCH)))
+    there = np.array([c.coordinate(float((values | truth)[c.name])) for c in free])
+    nominal = Fit(own, there[:-1].copy())
+    fit_together([nominal], replays, noise)
+    told = Nominal(nominal, noise, Certificate((nominal.chi2,), True, 0.0))
+    rng, lost = np.random.default_rng(0), 0
+    for _ in range(6):
+        known = Fit(free, there + 0.25 * rng.normal(size=len(there)))
+        once = known.fresh()
+        fit_together([once], replays, noise)
+        lost += once.chi2 > 100 * len(measured.values)
+        found = carried(known, replays, told)
+        assert found.names == tuple(c.name for c in free)
+        assert found.values[late] == pytest.approx(0.008, rel=0.1)
+        assert found.chi2 < 1.1 * len(measured.values)
+    assert lost == 2

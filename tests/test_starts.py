@@ -15,7 +15,7 @@ from pup.diagnosis.noise import assumed_noise
 from pup.diagnosis.nominal import free_names
 from pup.diagnosis.replays import Bench, Replays, threads
 from pup.diagnosis.residuals import Measured
-from pup.diagnosis.starts import LOUD, begun_anew, described, distinct, puzzling
+from pup.diagnosis.starts import DRIVEN, LOUD, begun_anew, described, distinct, puzzling
 from pup.physics.parameters import robot_space
 from tests.diagnosis_cases import BENCH, recordings
 
@@ -84,6 +84,9 @@ def test_what_explains_little_or_leaves_much_is_a_puzzle(replays: Replays) -> No
         before.chi2, after.chi2 = float(much * samples), float(left * samples)
         assert puzzling(before, [((), after)]) is puzzle
     assert puzzling(before, [])
+    before.chi2, after.chi2 = 11.0 * samples, 4.0 * samples
+    assert not puzzling(before, [((), after)])
+    assert puzzling(before, [((), after)], DRIVEN)
 
 
 def test_of_fits_with_the_same_effect_the_best_counts(replays: Replays) -> None:

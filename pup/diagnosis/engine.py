@@ -205,7 +205,7 @@ def _looked_again(
     first = task.look(followed_well(nominal, task.replays))
     if first is None:
         return done, None
-    base = carried(first.search, task.replays, nominal)
+    base = carried(first.search.model.fit, task.replays, nominal)
     if base is nominal.fit:
         return done, first
     again = task.search(nominal, first, base)

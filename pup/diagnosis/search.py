@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pup.diagnosis.beginnings import begun
 from pup.diagnosis.evidence import Projector, Trace, threshold, traced
 from pup.diagnosis.exchanges import Exchanger
 from pup.diagnosis.fit import Fit
@@ -17,7 +18,7 @@ from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.diagnosis.reweighing import Reweighing
 from pup.diagnosis.selection import full
-from pup.diagnosis.starts import closely
+from pup.diagnosis.starts import LOUD, closely
 from pup.diagnosis.tracing import traces
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def search(
     """
     progress("score test", 0.3)
     if base is None:
-        base = nominal.fit if first is None else carried(first, replays, nominal)
+        base = nominal.fit if first is None else carried(first.model.fit, replays, nominal)
     if first is not None and base is not nominal.fit and full(first.model, most):
         found = _seen_first(first, base, replays)  # nothing more is looked for
     else:
@@ -164,16 +165,27 @@ def _teller(progress: Callable[[str, float], None]) -> Callable[[Model], None]:
     return told
 
 
-def carried(first: Search, replays: Replays, nominal: Nominal) -> Fit:
-    """What a first look has found, fitted to all recordings; the nominal fit where that is better.
+def carried(known: Fit, replays: Replays, nominal: Nominal) -> Fit:
+    """A first look's model, fitted to all recordings; the nominal fit where that is better.
 
     What only the others show, as the floor's friction, starts as the nominal fit has it, or from
-    elsewhere.
+    elsewhere. The nominal model lost track of these others, and from a little off this one does
+    too: where it leaves more, or many times the noise, how they begin leads it to them.
+
+    Args:
+      known: the model's fit to some recordings.
+      replays: simulates all of them.
+      nominal: the fit of the nominal model to all.
     """
-    fit = extended(first.model.fit, nominal.fit)
-    if len(fit.at) > len(first.model.fit.at):
+    fit = extended(known, nominal.fit)
+    if len(fit.at) > len(known.at):
         start_best([fit], [[fit.at, *floors(fit)]], replays, nominal.noise)
+    other = fit.fresh()
     fit_together([fit], replays, nominal.noise)
+    if fit.chi2 >= min(nominal.fit.chi2, LOUD * len(replays.measured.values)):
+        begun([other], replays, nominal.noise)
+        fit_together([other], replays, nominal.noise)
+        fit = min(fit, other, key=lambda fit: fit.chi2)
     if fit.chi2 >= nominal.fit.chi2:
         return nominal.fit
     complete([fit], replays, nominal.noise)

@@ -26,6 +26,7 @@ from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.retracing import Retracer
 from pup.diagnosis.shortlist import FAINT, FURTHER, in_contact, shortlist, suspected
 from pup.diagnosis.starts import (
+    DRIVEN,
     LIMB,
     Tried,
     begun_anew,
@@ -170,7 +171,7 @@ class Selector:
         self._refit(tried, fit.chi2)
         if not model.hypotheses:
             tried += self._further(model, ranking, tried)
-        if not model.hypotheses and puzzling(fit, tried):
+        if not model.hypotheses and puzzling(fit, tried, DRIVEN):
             more, elsewhere = self._elsewhere()
             ranked = {score.trace.hypothesis for score in ranking}
             ranking += [score for score in more if score.trace.hypothesis not in ranked]

@@ -32,6 +32,9 @@ PUZZLING, GLARING = 0.5, 30.0
 """Where the best of all effects leaves this share of what is more than noise, or so many times the
 noise, they are begun elsewhere too: the right one may have stopped halfway, as a gear's friction
 that all but holds its joint."""
+DRIVEN = 0.2
+"""The same share where parameters were driven so far off that the described robot is looked
+at too: beside a torque limit of a quarter an armature explained 63 % of a lag."""
 LOUD = 6.0
 """A fit that leaves so many times the noise may have stopped anywhere, or lacks much."""
 LIMB = 6
@@ -90,12 +93,18 @@ def options(before: Fit, score: Score, fit: Fit) -> list[Array]:
     return places
 
 
-def puzzling(before: Fit, tried: Sequence[Tried]) -> bool:
-    """Whether the best of some effects leaves too much of what a fit has beyond noise."""
+def puzzling(before: Fit, tried: Sequence[Tried], share: float = PUZZLING) -> bool:
+    """Whether the best of some effects leaves too much of what a fit has beyond noise.
+
+    Args:
+      before: the fit.
+      tried: fits with an effect more each.
+      share: of it that is too much.
+    """
     assert before.residual is not None
     noise = len(before.residual)
     left = min((fit.chi2 for _, fit in tried), default=before.chi2) - noise
-    return left > min(PUZZLING * (before.chi2 - noise), GLARING * noise)
+    return left > min(share * (before.chi2 - noise), GLARING * noise)
 
 
 def glaring(left: float, samples: int) -> bool:
