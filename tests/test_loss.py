@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from recordings import make
 
 from pup.physics.simulator import Trajectories, tick_slices
@@ -138,6 +140,25 @@ def test_a_lean_at_rest_is_no_error_of_what_follows(lost: bool) -> None:
     settled = np.hypot(0.04, 0.02)  # of the first tick, which is where it was put
     expected = 9 * np.hypot(LOST_POSITION, LOST_POSITION) if lost else 0.05 + settled
     assert told == pytest.approx(expected)
+
+
+@example(fallen=1.55, simulated=-1.55, lean=0.3)
+@given(
+    fallen=st.floats(-np.pi, np.pi), simulated=st.floats(-np.pi, np.pi), lean=st.floats(-0.3, 0.3)
+)
+def test_a_lean_at_rest_matters_nowhere_on_the_circle(
+    fallen: float, simulated: float, lean: float
+) -> None:
+    """However far it falls, an IMU that sits askew says the same as one that does not."""
+    measured, tilt = np.zeros((10, 2)), np.zeros((10, 2))
+    measured[8:, 0], tilt[8:, 0] = fallen, simulated
+    told = []
+    for askew in (0.0, lean):
+        stand = rested(measured + np.array([askew, 0.0]))
+        seen = replayed((stand,), tilt=tilt)
+        told.append(np.abs(loss_of(stand).errors(seen)[1][0, 8:, 0]))
+    assert (told[1] <= np.pi).all()
+    assert told[1] == pytest.approx(told[0], abs=1e-9)
 
 
 def test_a_tick_without_tilt_does_not_hide_a_lean_at_rest() -> None:

@@ -186,11 +186,10 @@ class ReplayLoss:
         A robot leans where its IMU or the zeros of its encoders are a degree off. With the soles on
         the floor that says nothing of its dynamics, and would outweigh all that does.
         """
-        away = trajectories.tilt - self.tilt
-        away = (away + np.pi) % (2 * np.pi) - np.pi
+        away = _short_way(trajectories.tilt - self.tilt)
         for part, rest in zip(self.ticks, self.rests, strict=True):
             if rest is not None:
-                away[:, part] -= _known_mean(away[:, rest])
+                away[:, part] = _short_way(away[:, part] - _known_mean(away[:, rest]))
         return np.where(np.isnan(away) & ~np.isnan(self.tilt), LOST_POSITION, away)
 
     def _feet_error(self, trajectories: Trajectories) -> Array:
@@ -232,6 +231,11 @@ def _difference(simulated: Array, measured: Array, lost: Array | float) -> Array
     """Error where measured, `lost` where the simulation broke down, NaN where not measured."""
     error = simulated - measured
     return np.where(np.isnan(error) & ~np.isnan(measured), lost, error)
+
+
+def _short_way(angle: Array) -> Array:
+    """An angle the short way round the circle, rad."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _length(error: Array) -> Array:
