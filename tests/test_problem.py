@@ -89,9 +89,9 @@ def test_recordings_whose_slopes_do_not_fit_are_refused(
     problem = of_walker(walker, 12)
     errors, _ = problem.errors(np.full((5, 5), 0.5))
     assert errors.shape[1] == 18 * problem.loss.numbers
-    monkeypatch.setattr(problems, "_memory", lambda: 3 * errors.nbytes)
+    monkeypatch.setattr(problems, "memory", lambda: 3 * errors.nbytes)
     problem.check()
-    monkeypatch.setattr(problems, "_memory", lambda: 3 * errors.nbytes - 1)
+    monkeypatch.setattr(problems, "memory", lambda: 3 * errors.nbytes - 1)
     with pytest.raises(InputError, match="18 samples of 10 errors, by 5 parameters, take") as told:
         problem.check()
     assert "\n" not in str(told.value)

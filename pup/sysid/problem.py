@@ -1,7 +1,6 @@
 """What a fit evaluates: recordings, a torque law, and the parameters that are free."""
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,6 +16,7 @@ from pup.physics.simulator import Trajectories
 from pup.recording import Recording
 from pup.robot import Actuator, RobotDescription
 from pup.sysid.loss import ReplayLoss, Terms
+from pup.sysid.memory import memory
 
 Array = NDArray[np.float64]
 
@@ -128,15 +128,10 @@ class Problem:
           InputError: they are that long.
         """
         samples, free = self.loss.ticks[-1].stop, len(self.free)
-        needed, there = SLOPES * 8 * self.loss.numbers * samples * free, _memory()
+        needed, there = SLOPES * 8 * self.loss.numbers * samples * free, memory()
         if needed > there:
             raise InputError(
                 f"{samples} samples of {self.loss.numbers} errors, by {free} parameters, take "
-                f"{needed / 2**30:.1f} GiB; this computer has {there / 2**30:.1f}: give fewer or "
-                "shorter recordings"
+                f"{needed / 2**30:.1f} GiB; this computer, or its container, has "
+                f"{there / 2**30:.1f}: give fewer or shorter recordings"
             )
-
-
-def _memory() -> int:
-    """Of this computer, bytes."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
