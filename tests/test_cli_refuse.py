@@ -113,6 +113,13 @@ for _name in BROKEN:
         return place.replay(bad), (bad, *words)
 
 
+@case("a recording of three rows, which tell nothing of a motion")
+def _(place: Place) -> Made:
+    short = edited(place, lambda columns, _: columns.update({n: v[:3] for n, v in columns.items()}))
+    command = ["presysid", short, "--robot", "servo_bench", "--out", place.out, *TINY]
+    return command, ("positions in more than 2 rows", "record longer")
+
+
 @case("a recording without one of the joints")
 def _(place: Place) -> Made:
     table = pq.read_table(place.leg / "step_0.1.parquet").drop_columns(

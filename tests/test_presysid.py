@@ -145,7 +145,7 @@ def test_where_nothing_was_read_there_is_nothing_to_fit(
 def test_recordings_longer_than_the_memory_are_refused_before_any_fit(
     robot: RobotDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(problems, "_memory", lambda: 1000)
+    monkeypatch.setattr(problems, "memory", lambda: 1000)
     job, runner = job_of(robot, (stepped("a", "suspended"),) * 2, tmp_path, Options("pd"))
     with pytest.raises(InputError, match="give fewer or shorter recordings"):
         job.run()

@@ -97,6 +97,49 @@ def test_recordings_whose_slopes_do_not_fit_are_refused(
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.parametrize("rows", [2, 3, 5])
+def test_recordings_that_end_where_they_begin_are_refused(
+    walker: RobotDescription, rows: int
+) -> None:
+    """The first row tells where one starts: five more tell something of a motion."""
+    long, short = swing(walker, 6, "suspended"), swing(walker, rows, "ground")
+    enough = replace(of_walker(walker, 12), recordings=(long, short))
+    enough.check()
+    with pytest.raises(InputError, match=f"positions in more than {rows - 1} rows") as told:
+        replace(enough, recordings=(short,)).check()
+    assert "\n" not in str(told.value)
+
+
+def test_readings_that_are_missing_tell_nothing(walker: RobotDescription) -> None:
+    problem = of_walker(walker, 12)
+    position = problem.recordings[0].position.copy()
+    position[2:] = np.nan
+    blind = replace(problem, recordings=(replace(problem.recordings[0], position=position),))
+    with pytest.raises(InputError, match="positions in more than 1 rows"):
+        blind.check()
+
+
+def test_fewer_readings_than_parameters_are_refused() -> None:
+    """Of a servo with the network's 27 weights beside its own parameters."""
+    bench = RobotDescription.load("servo_bench")
+    space = robot_space(bench, "nn_pd")
+
+    def of_rows(rows: int) -> Problem:
+        run = make(
+            robot=bench.name,
+            joints=bench.joint_names,
+            time=np.arange(rows) / 50,
+            target=np.zeros((rows, 1)),
+            position=np.zeros((rows, 1)),
+        )
+        return Problem(bench, (run,), "nn_pd", space, space.names)
+
+    free = len(space.names)
+    of_rows(free + 1).check()
+    with pytest.raises(InputError, match=f"{free - 1} readings cannot tell {free} parameters"):
+        of_rows(free).check()
+
+
 def test_more_candidates_take_no_more_memory(
     walker: RobotDescription, monkeypatch: pytest.MonkeyPatch
 ) -> None:

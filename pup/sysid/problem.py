@@ -26,6 +26,8 @@ MEMORY = 256 * 2**20
 """Bytes that trajectories and what equation 1 makes of them may take at once, about."""
 COPIES = 3.5
 """Arrays as large as the trajectories that equation 1 holds beside one another, with them."""
+FEWEST = 5
+"""Rows of a recording, after the first, in which its motion is read."""
 SLOPES = 3
 """Arrays as large as the Jacobian that are needed beside one another to take it."""
 _VERSIONS = (str(MODEL), *(version(p) for p in ("mujoco", "numpy", "numba", "nevergrad", "cma")))
@@ -122,11 +124,13 @@ class Problem:
         return np.concatenate([errors for errors, _ in parts]), parts[0][1]
 
     def check(self) -> None:
-        """Refuse recordings whose slopes, by all free parameters, this computer could not hold.
+        """Refuse recordings that cannot be fitted.
 
         Raises:
-          InputError: they are that long.
+          InputError: they are so short that they tell nothing, or so long that this computer could
+            not hold their slopes by all free parameters.
         """
+        self._check_readings()
         samples, free = self.loss.ticks[-1].stop, len(self.free)
         needed, there = SLOPES * 8 * self.loss.numbers * samples * free, memory()
         if needed > there:
@@ -134,4 +138,21 @@ class Problem:
                 f"{samples} samples of {self.loss.numbers} errors, by {free} parameters, take "
                 f"{needed / 2**30:.1f} GiB; this computer, or its container, has "
                 f"{there / 2**30:.1f}: give fewer or shorter recordings"
+            )
+
+    def _check_readings(self) -> None:
+        """Refuse recordings that all end where they begin, and fewer readings than parameters.
+
+        A recording's first row tells where it starts, and nothing of what follows.
+        """
+        known = [~np.isnan(self.loss.position[part][1:]) for part in self.loss.ticks]
+        if (rows := max(int(told.any(axis=1).sum()) for told in known)) < FEWEST:
+            raise InputError(
+                f"no recording has positions in more than {rows} rows after its first, and fewer "
+                f"than {FEWEST} tell nothing of a motion; record longer"
+            )
+        if (readings := sum(int(told.sum()) for told in known)) < len(self.free):
+            raise InputError(
+                f"{readings} readings cannot tell {len(self.free)} parameters of the "
+                f"{self.actuator} torque law; record longer, or give more recordings"
             )
