@@ -26,6 +26,7 @@ MAX_ID, MAX_ID_BYTES = 120, 230
 """Longest id; file systems let a name have 255 bytes, and a file on its way to it has a longer."""
 MAX_DURATION = 86_400.0  # s; longer means other units or a clock that jumped
 MAX_TICK = 0.5  # s; no servo is driven as slowly, but a clock in ms looks so
+MAX_GAP = 60.0  # s; no bus is silent as long while a robot moves, and a replay would wait it out
 BEYOND, MARGIN = 4.0, 2.0
 """Play, a fall or a turn of its servo may bring a joint beyond its limits, but not beyond so many
 times the larger one, and so much more, rad; degrees and encoder ticks are."""
@@ -156,9 +157,7 @@ def check_units(joints: Sequence[Joint], columns: Mapping[str, Array]) -> None:
       joints: of the robot.
       columns: as for `check_values`, valid.
     """
-    tick = float(np.median(np.diff(columns["time"])))
-    if tick > MAX_TICK:
-        raise InputError(f"column 'time': rows are {tick:g} s apart; is time in ms?")
+    _check_ticks(columns["time"])
     for joint in joints:
         largest = BEYOND * max(abs(joint.lower), abs(joint.upper)) + MARGIN
         for name in (f"target/{joint.name}", f"position/{joint.name}"):
@@ -178,6 +177,18 @@ def check_units(joints: Sequence[Joint], columns: Mapping[str, Array]) -> None:
                 f"column {name!r}, row {row}: {values[row]:g}, beyond {largest:.3g} rad; are these "
                 "degrees?"
             )
+
+
+def _check_ticks(time: Array) -> None:
+    """Refuse rows that are further apart than those of a robot that is driven."""
+    gaps = np.diff(time)
+    if (tick := float(np.median(gaps))) > MAX_TICK:
+        raise InputError(f"column 'time': rows are {tick:g} s apart; is time in ms?")
+    for row in np.flatnonzero(gaps > MAX_GAP) + 1:
+        raise InputError(
+            f"column 'time', row {row}: {gaps[row - 1]:g} s after the row before; did the clock "
+            "jump? Mend it, or make two recordings of it"
+        )
 
 
 def _check_turns(joints: Sequence[str], columns: Mapping[str, Array]) -> None:

@@ -249,6 +249,21 @@ def test_validate_refuses_other_units_and_lets_a_robot_fall() -> None:
         dataclasses.replace(SERVO, time=[0.0, 30.0, 60.0]).validate(robot)
 
 
+@pytest.mark.parametrize("row", [1, 7, 19])
+def test_validate_refuses_a_clock_that_jumped(row: int) -> None:
+    """By an hour, as one that is set on the way; a bus that is silent for a while is none."""
+    robot = RobotDescription.load("servo_bench")
+    still = {"target": np.zeros((20, 1)), "position": np.zeros((20, 1))}
+
+    def with_gap(gap: float) -> Recording:
+        time = 0.02 * np.arange(20) + np.where(np.arange(20) < row, 0.0, gap)
+        return dataclasses.replace(SERVO, **still, time=time)
+
+    with_gap(5.0).validate(robot)
+    with pytest.raises(InputError, match=rf"'time', row {row}: 3600\.02 s after .* clock jump"):
+        with_gap(3600.0).validate(robot)
+
+
 def test_validate_refuses_angles_that_begin_anew_after_a_turn() -> None:
     """A servo that passes the end of its encoder's turn, with a missing sample there."""
     robot = RobotDescription.load("servo_bench")
