@@ -315,6 +315,15 @@ def test_a_data_set_is_of_one_robot_and_never_written_over(tmp_path: Path) -> No
     assert files(tmp_path) == before
 
 
+@pytest.mark.parametrize("format", exporters.FORMATS)
+def test_two_recordings_of_one_id_are_refused(tmp_path: Path, format: str) -> None:
+    """Of robots of their own, as a notebook may hold them: one file would hold but one of them."""
+    folder = tmp_path / "new"
+    with pytest.raises(InputError, match="2 recordings have the id 'full'; give each its own"):
+        export(format, folder, FULL, make(), replace(FULL, robot="leg"))
+    assert not folder.exists()
+
+
 def test_somebody_s_own_log_is_never_written_over(tmp_path: Path) -> None:
     """The log that a recording was imported from has its name."""
     log = write_ros(tmp_path / "walk.mcap")

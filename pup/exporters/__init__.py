@@ -1,6 +1,7 @@
 """Recordings, with or without their replays, as files of other programs: a module per format."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -50,9 +51,11 @@ def export_takes(
       `files`, and what else the format tells.
 
     Raises:
-      InputError: the format cannot hold these recordings, or the folder is not free for them.
+      InputError: the format cannot hold these recordings, two of them have one id, or the folder
+        is not free for them.
     """
     require(format, rate)
+    _check_ids(takes)
     _check_name(format, folder)
     folder.mkdir(parents=True, exist_ok=True)
     if format == "lerobot":
@@ -73,6 +76,15 @@ def export_takes(
         for file in files:
             os.replace(Path(new) / file.name, file)
     return {"files": [str(file) for file in files]}
+
+
+def _check_ids(takes: Sequence[Take]) -> None:
+    """Refuse two takes of one id: a file of its name would hold one of them."""
+    for name, count in Counter(take.recording.id for take in takes).items():
+        if count > 1:
+            raise InputError(
+                f"{count} recordings have the id {name!r}; give each its own, or export them apart"
+            )
 
 
 def _check_name(format: str, folder: Path) -> None:
