@@ -186,7 +186,7 @@ def transfer(verb: argparse.ArgumentParser) -> None:
     study = verb.add_argument_group("the study, where it is made; defaults are the service's")
     for name, limits, kind, told in (
         ("--trials", (1, 1000), int, "walks until eta is chosen (25)"),
-        ("--initial", (1, 1000), int, "uniform ones among them (5)"),
+        ("--initial", (1, 1000), int, "uniform ones among them (5, or all)"),
         ("--least-gain", (0.0, 0.99), float, "expected of a walk, of the best's distance (0)"),
         ("--repeats", (0, 100), int, "walks of the chosen eta, and of each compared one (5)"),
         ("--horizon", (0.1, 600.0), float, "longest walk, s (15)"),

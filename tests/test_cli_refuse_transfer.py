@@ -234,3 +234,15 @@ def test_a_token_that_is_no_operators_is_refused(tmp_path, monkeypatch):
         monkeypatch.setenv("PUP_TOKEN", service.tokens["viewer"])
         assert_refused(pup("transfer", *options), "role operator", "viewer")
         assert not (tmp_path / "study.json").exists()
+
+
+def test_more_initial_trials_than_trials_are_refused(tmp_path, monkeypatch):
+    policy = agents.bundle(tmp_path / "policy")
+    with gateways.running(tmp_path / "data") as service:
+        monkeypatch.setenv("PUP_TOKEN", service.tokens["operator"])
+        options = ("--policy", policy, "--study", "walk", "--url", service.url, "--out", tmp_path)
+        done = pup("transfer", *options, "--trials", 3, "--initial", 4)
+        assert_refused(done, "initial (4) must be at most trials (3)")
+        with service.client() as http:
+            assert http.get("/v1/studies/walk").status_code == 404
+        assert not (tmp_path / "study.json").exists()

@@ -120,6 +120,8 @@ def test_the_gate_tells_how_many_failures_pause_a_study(service, told, pauses_af
         {"lower": [0, 0]},
         {"compare": [[0, 0]]},
         {"initial": 0},
+        {"initial": 26},
+        {"initial": 5, "trials": 4},
         {"unknown": 1},
         {"gate": "none"},
         {"seed": -1},
@@ -135,6 +137,14 @@ def test_the_gate_tells_how_many_failures_pause_a_study(service, told, pauses_af
 def test_studies_that_cannot_be_are_refused(service, wrong):
     with service.client() as http:
         is_problem(http.post("/v1/studies", json=STUDY | {"name": "wrong"} | wrong), 422)
+
+
+def test_of_few_trials_all_are_initial(service):
+    """What was not asked for is never refused: the usual number is five."""
+    with service.client() as http:
+        for name, trials, initial in (("few", 3, 3), ("many", 8, 5)):
+            made = http.post("/v1/studies", json=STUDY | {"name": name, "trials": trials})
+            assert (made.status_code, made.json()["settings"]["initial"]) == (201, initial)
 
 
 def test_a_whole_number_may_be_written_with_a_point(service):

@@ -13,7 +13,8 @@ pytest.importorskip("botorch")
 
 from commandline import pup
 
-from services.gateway.store import TRIED, TRY, WAITS, Store, engine_options
+from pup.transfer.study import Study, StudySettings
+from services.gateway.store import TRIED, TRY, WAITS, Change, Store, engine_options
 
 SERVER = "postgresql+psycopg://pup:secret@db/pup"
 
@@ -54,6 +55,22 @@ def test_a_database_that_does_not_answer_yet_is_no_bad_input(
     assert done.code == 1
     assert done.err.splitlines()[-1].startswith("pup serve: database: does not answer now (")
     assert "Traceback" not in done.err
+
+
+def test_a_study_of_before_whose_trials_are_all_initial_goes_on(tmp_path: Path) -> None:
+    """When more of them could be initial than there were, `--trials 3` alone stored 5 of 3."""
+
+    async def live() -> None:
+        file = tmp_path / "gateway.db"
+        store = Store(f"sqlite:///{file}")
+        study = Study("few", StudySettings("darwin_op2", "a" * 64, trials=3, initial=3))
+        await store.write(Change(study))
+        with closing(sqlite3.connect(file)) as before, before:
+            before.execute("UPDATE studies SET settings = json_set(settings, '$.initial', 5)")
+        assert await store.studies() == [(study, None)]
+        store.close()
+
+    asyncio.run(live())
 
 
 @pytest.mark.parametrize("url", ["sqlite://", "sqlite:////x/y.db", "mysql://db/pup"])

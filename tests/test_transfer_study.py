@@ -362,6 +362,8 @@ def test_a_study_that_no_robot_can_walk_pauses():
         {"compare": ((0.0, 0.0, float("nan")),)},
         {"initial": 0},
         {"trials": 0},
+        {"trials": 4},
+        {"trials": 7, "initial": 8},
     ],
 )
 def test_wrong_settings_are_refused(wrong):

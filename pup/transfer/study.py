@@ -81,6 +81,8 @@ class StudySettings:
             raise InputError(f"each eta in compare needs {n} finite numbers")
         if min(self.trials, self.initial) < 1:
             raise InputError("trials and initial must be 1 or more")
+        if self.initial > self.trials:
+            raise InputError(f"initial ({self.initial}) must be at most trials ({self.trials})")
         if not 0 <= self.least_gain < 1:
             raise InputError("least_gain must be from 0 up to 1")
 

@@ -20,6 +20,12 @@ def settings_of(told: Row) -> StudySettings:
     return StudySettings(**known | {"gate": Gate(known.get("gate", Gate.OPERATOR))})
 
 
+def _stored(told: Row) -> StudySettings:
+    """Settings that were stored, when more of the trials than there were could be initial."""
+    most = told.get("trials", StudySettings.trials)
+    return settings_of(told | {"initial": min(told.get("initial", StudySettings.initial), most)})
+
+
 def study_row(study: Study) -> Row:
     """The row of a study, without its trials."""
     return {
@@ -63,7 +69,7 @@ def study_of(row: Row, trials: list[Row]) -> Study:
     """The study of its row and its trials' rows."""
     return Study(
         row["name"],
-        settings_of(row["settings"]),
+        _stored(row["settings"]),
         StudyState(row["state"]),
         row["reason"],
         row["fence"],

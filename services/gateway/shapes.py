@@ -75,7 +75,10 @@ class NewStudy(Strict):
     lower: Eta = list(Defaults.lower)
     upper: Eta = list(Defaults.upper)
     trials: Annotated[int, Field(ge=1, le=TRIALS), WITHOUT_FRACTION] = Defaults.trials
-    initial: Annotated[int, Field(ge=1, le=TRIALS), WITHOUT_FRACTION] = Defaults.initial
+    initial: Annotated[
+        Annotated[int, Field(ge=1, le=TRIALS), WITHOUT_FRACTION] | None,
+        Field(description=f"At most trials. Null or left out: {Defaults.initial}, or all of them."),
+    ] = None
     least_gain: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = Defaults.least_gain
     repeats: Annotated[int, Field(ge=0, le=REPEATS), WITHOUT_FRACTION] = Defaults.repeats
     compare: Annotated[list[Eta], Field(max_length=16)] = []
@@ -93,9 +96,11 @@ class NewStudy(Strict):
 
     @model_validator(mode="after")
     def _filled(self) -> Self:
-        """The failures that the gate goes with, where none are told."""
+        """What goes by the gate or the trials, where it is not told."""
         if self.failures is None:
             self.failures = FAILURES[self.gate]
+        if self.initial is None:
+            self.initial = min(Defaults.initial, self.trials)
         return self
 
 
