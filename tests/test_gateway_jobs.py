@@ -4,8 +4,10 @@ import asyncio
 import json
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 
 import gateways
 import httpx
@@ -127,6 +129,27 @@ def test_a_key_is_one_job(service):
     with service.client() as http, service.client("admin") as admin:
         assert http.post("/v1/jobs", json=FIT, headers=headers).json()["id"] == first.json()["id"]
         assert admin.post("/v1/jobs", json=FIT, headers=headers).json()["id"] != first.json()["id"]
+
+
+def test_a_repeated_submission_is_answered_as_the_description_says(service):
+    """Alike for a week, and then with what has become of the job."""
+    headers = {"Idempotency-Key": "fit-of-last-week"}
+    with service.client() as http:
+        told = http.get("/openapi.json").json()["paths"]["/v1/jobs"]["post"]
+        (key,) = (p for p in told["parameters"] if p["name"] == "Idempotency-Key")
+        assert "for a week" in key["description"] and "same status" in key["description"]
+        assert "answered so again" in told["responses"]["201"]["description"]
+        assert "kept no longer" in told["responses"]["200"]["description"]
+        first, again = (http.post("/v1/jobs", json=FIT, headers=headers) for _ in range(2))
+        assert (first.status_code, again.status_code) == (201, 201)
+        assert again.content == first.content
+        assert "idempotent-replayed" not in first.headers
+        assert again.headers["idempotent-replayed"] == "true"
+        with closing(sqlite3.connect(service.data / "gateway.db")) as database, database:
+            database.execute("DELETE FROM answers WHERE key = 'fit-of-last-week'")
+        later = http.post("/v1/jobs", json=FIT, headers=headers)
+        assert (later.status_code, later.json()["id"]) == (200, first.json()["id"])
+        assert later.headers["location"] == first.headers["location"]
 
 
 def test_a_job_that_runs_is_cancelled_without_the_cluster(service):

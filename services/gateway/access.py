@@ -65,8 +65,8 @@ IdempotencyKey = Annotated[
         min_length=1,
         max_length=128,
         pattern=r"^[!-~]+$",
-        description="Any text of your own: the same request with the same key is carried out once "
-        "and answered alike.",
+        description="Any text of your own: the same request with the same key is carried out once, "
+        "and for a week answered with the same status and body, and `Idempotent-Replayed: true`.",
     ),
 ]
 

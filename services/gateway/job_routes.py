@@ -27,6 +27,8 @@ from services.job_folder import turn
 CHUNK = 2**16
 FOLLOW = 0.5
 """Between two looks at the log of a job that runs, s."""
+SUBMITTED = "The job; the same request with its key is answered so again, but for its header."
+KNOWN = "This key has a job, whose first answer is kept no longer: the job as it is now."
 ARTIFACTS = 10_000
 """Artefacts of a job on a page of their list."""
 
@@ -163,7 +165,8 @@ async def list_jobs(
     "/jobs",
     status_code=201,
     response_model=JobShape,
-    responses=WRITE | {200: {"description": "This key has a job already.", "model": JobShape}},
+    responses=WRITE
+    | {201: {"description": SUBMITTED}, 200: {"description": KNOWN, "model": JobShape}},
 )
 async def submit_job(
     request: Request, user: Operator, wanted: NewJob, key: IdempotencyKey = None
