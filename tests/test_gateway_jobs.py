@@ -216,6 +216,23 @@ def test_artefacts_by_name(service):
         assert none == {"artifacts": [], "next": None}
 
 
+@pytest.mark.parametrize(
+    ("asked", "status"),
+    [("bytes=256000-", 416), ("bytes=300000-300001", 416), ("bytes=x", 400), ("x", 400)],
+)
+def test_a_range_that_cannot_be_had_is_a_problem(service, asked, status):
+    """As all errors are, and beyond the end with the file's size, by which a client asks anew."""
+    place = "/v1/jobs/job-done/artifacts/checkpoints/fit 1%25.npz"
+    with service.client("viewer") as http:
+        answer = http.get(place, headers={"Range": asked})
+        assert repr(asked) in is_problem(answer, status)
+        size = "bytes */256000" if status == 416 else None
+        assert answer.headers.get("content-range") == size
+        assert len(http.get(place, headers={"Range": "bytes=255999-"}).content) == 1
+        told = http.get("/openapi.json").json()["paths"]["/v1/jobs/{job}/artifacts/{name}"]["get"]
+        assert list(told["responses"]["416"]["content"]) == ["application/problem+json"]
+
+
 @pytest.fixture(scope="module")
 def many(service):
     """More files than a page of their list holds; those that pages look for come last."""

@@ -5,8 +5,9 @@ import json
 from collections.abc import AsyncIterator
 from typing import Any
 
-from fastapi import Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi import HTTPException, Request
+from fastapi.responses import FileResponse, Response, StreamingResponse
+from starlette.types import Message, Receive, Scope, Send
 
 from services.gateway.access import asking
 from services.gateway.conductor import Conductor
@@ -25,6 +26,29 @@ def as_json(value: Any, status: int = 200, **headers: str) -> Response:
     """A JSON value as an answer."""
     body = json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
     return Response(body, status, headers, "application/json")
+
+
+class FileAnswer(FileResponse):
+    """A file, or a range of its bytes; one that cannot be had is refused as all else is."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it.
+
+        Raises:
+          HTTPException: the framework has a text of its own for a range that it refuses.
+        """
+
+        async def sending(message: Message) -> None:
+            status = message.get("status", 200)
+            if status >= 400:
+                told = {k.decode(): v.decode() for k, v in message["headers"]}
+                place = told.get("content-range")
+                headers = {"Content-Range": place} if place else None
+                asked = Request(scope).headers.get("Range", "")[:200]
+                raise HTTPException(status, f"Range {asked!r} cannot be had of this file", headers)
+            await send(message)
+
+        await super().__call__(scope, receive, sending)
 
 
 def stream(request: Request, name: str) -> Response:

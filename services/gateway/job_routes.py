@@ -8,12 +8,12 @@ from itertools import islice
 from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Path, Query, Request
-from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from fastapi.responses import PlainTextResponse, Response, StreamingResponse
 from pydantic import BaseModel, Field
 
 from services.gateway import names
 from services.gateway.access import IdempotencyKey, IdempotentRoute, asking, needs
-from services.gateway.answers import as_json, stream
+from services.gateway.answers import FileAnswer, as_json, stream
 from services.gateway.dispatcher import LIST, NO_STORAGE, Dispatcher, NoJobsError
 from services.gateway.jobs import Job, JobState
 from services.gateway.keys import Role, User
@@ -260,8 +260,8 @@ async def list_artifacts(
 
 @router.get(
     "/jobs/{job:name}/artifacts/{name:path}",
-    responses=FILES | {200: {"content": {"application/octet-stream": {}}}},
-    response_class=FileResponse,
+    responses=FILES | responses(416) | {200: {"content": {"application/octet-stream": {}}}},
+    response_class=FileAnswer,
 )
 async def get_artifact(request: Request, _: Viewer, job: JobName, name: str) -> Response:
     """A file that a job wrote; ranges of bytes can be had."""
@@ -269,7 +269,7 @@ async def get_artifact(request: Request, _: Viewer, job: JobName, name: str) -> 
     path = await on_storage(folder.file, name)
     if path is None:
         raise HTTPException(404, f"{job} has no artefact {name[:200]}")
-    return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+    return FileAnswer(path, media_type="application/octet-stream", filename=path.name)
 
 
 @router.get(

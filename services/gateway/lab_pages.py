@@ -11,13 +11,13 @@ from typing import TypeVar
 from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request
-from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
 from pup.errors import InputError
 from services.gateway import artefacts, charts
 from services.gateway.access import asking
-from services.gateway.answers import conductor_of
+from services.gateway.answers import FileAnswer, conductor_of
 from services.gateway.artefacts import BOUNDS, DIAGNOSES, TRAINING, Artefact, Kind
 from services.gateway.documents import Document
 from services.gateway.html import login, page, part
@@ -177,7 +177,7 @@ async def report(request: Request, job: str, name: str) -> Response:
     if path.suffix != ".html":
         return RedirectResponse(f"/v1/jobs/{job}/artifacts/{quote(name)}", 303)
     headers = {"Content-Security-Policy": SANDBOX}
-    return FileResponse(path, media_type="text/html; charset=utf-8", headers=headers)
+    return FileAnswer(path, media_type="text/html; charset=utf-8", headers=headers)
 
 
 async def _list(request: Request, kind: Kind[T]) -> Response:
