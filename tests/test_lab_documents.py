@@ -1,5 +1,6 @@
 """What pages read of recordings and of jobs' documents, and how they draw it."""
 
+import asyncio
 import json
 import math
 import os
@@ -8,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gateways
+import httpx
 import numpy as np
 import pytest
 import stored_findings
@@ -16,9 +19,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 pytest.importorskip("fastapi")
+pytest.importorskip("botorch")
 
 from pup.errors import InputError
-from services.gateway import artefacts, charts, drawing
+from services.gateway import artefacts, charts, drawing, recordings
 from services.gateway.documents import BoundsDocument, DiagnosisDocument, TrainingDocument
 from services.gateway.recordings import Shelves
 from services.job_folder import folder_of, inside
@@ -197,18 +201,66 @@ def test_recordings_are_listed_with_what_is_wrong_with_them(tmp_path: Path) -> N
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
     (tmp_path / "notes.txt").write_text("none")
     (tmp_path / "z.parquet").symlink_to(tmp_path / "b" / "currents.parquet")
-    listed, more = Shelves({"lab": tmp_path}).listed("lab")
-    assert [r.name for r in listed] == ["a.parquet", "b/currents.parquet"] and not more
+    listing = Shelves({"lab": tmp_path}).listed("lab")
+    listed = listing.shown
+    assert [r.name for r in listed] == ["a.parquet", "b/currents.parquet"]
+    assert (listing.end, listing.count) == (2, "2")
     assert "not a readable Parquet file" in listed[0].trouble
     assert str(tmp_path) not in listed[0].trouble
     header = listed[1].header
     assert header and header.joints == ("servo",) and header.rate == pytest.approx(100)
 
 
+@given(st.integers(0, 25), st.integers(1, 10), st.integers(1, 40))
+def test_pages_of_a_list_have_every_recording_once(
+    tmp_path_factory: pytest.TempPathFactory, count: int, listed: int, looked: int
+) -> None:
+    """And say how many there are; of more files than are looked at, that there may be more."""
+    folder = tmp_path_factory.mktemp("lab")
+    names = [f"{number:02}.parquet" for number in range(count)]
+    for name in names:
+        (folder / name).touch()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recordings, "LISTED", listed)
+        patch.setattr(recordings, "LOOKED", looked)
+        shelves, seen, at = Shelves({"lab": folder}), [], 0
+        while True:
+            page = shelves.listed("lab", at)
+            assert page.skipped == at and len(page.shown) <= listed
+            seen, at = [*seen, *(r.name for r in page.shown)], page.end
+            if at >= page.total:
+                break
+        assert seen == names[:looked]
+        assert page.count == (f"{count}" if count <= looked else f"{looked} or more")
+        assert shelves.listed("lab", 99).skipped == 0
+
+
+def test_a_page_of_recordings_leads_to_the_next_one(tmp_path: Path) -> None:
+    """And says how many there are, as the first page of all does."""
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    for number in range(recordings.LISTED + 2):
+        (lab / f"{number:03}.parquet").touch()
+    with gateways.running(tmp_path / "data", RECORDINGS=str(lab)) as service:
+        with service.client("viewer") as http:
+            assert "502" in http.get("/").text
+            first = http.get("/recordings").text
+            assert "1 to 500 of 502" in first and "500.parquet" not in first
+            (way,) = re.findall(r'href="([^"]*)">the next ones', first)
+            second = http.get(way).text
+            assert "501 to 502 of 502" in second and "the next ones" not in second
+            assert re.findall(r'href="/recordings/lab/([^"]*)"', second) == [
+                *("500.parquet", "501.parquet"),
+            ]
+            assert http.get("/recordings/nowhere").status_code == 404
+            assert http.get("/recordings/lab?skip=-1").status_code == 422
+        assert httpx.get(f"{service.url}/recordings/lab").status_code == 303
+
+
 def test_a_file_s_name_that_no_page_can_hold_does_not_hide_the_others(tmp_path: Path) -> None:
     stored_findings.currents().write(tmp_path / "currents.parquet")
     (tmp_path / os.fsdecode(b"gr\xf6\xdfe.parquet")).write_bytes(b"PAR1")
-    first, second = Shelves({"lab": tmp_path}).listed("lab")[0]
+    first, second = Shelves({"lab": tmp_path}).listed("lab").shown
     assert first.header and second.trouble == "its name is not UTF-8; rename it"
     assert second.name.encode().decode() == "gr\ufffd\ufffde.parquet"
 
@@ -227,16 +279,12 @@ def test_a_folder_that_may_be_read_and_not_entered_does_not_hide_the_others(
         return real(path, *args, **options)
 
     monkeypatch.setattr(os, "stat", stat)
-    assert [r.name for r in Shelves({"lab": tmp_path}).listed("lab")[0]] == ["currents.parquet"]
+    assert [r.name for r in Shelves({"lab": tmp_path}).listed("lab").shown] == ["currents.parquet"]
 
 
 def test_a_recording_that_is_too_large_is_not_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import asyncio
-
-    from services.gateway import recordings
-
     stored_findings.currents().write(tmp_path / "currents.parquet")
     shelves = Shelves({"lab": tmp_path})
     assert asyncio.run(shelves.read(shelves.file("lab", "currents.parquet"))).id == "currents"

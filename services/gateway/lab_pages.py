@@ -7,10 +7,10 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 from urllib.parse import quote
 
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
@@ -23,7 +23,7 @@ from services.gateway.documents import Document
 from services.gateway.html import login, page, part
 from services.gateway.job_routes import dispatcher_of
 from services.gateway.jobs import Job
-from services.gateway.recordings import Shelves
+from services.gateway.recordings import LOOKED, Shelves
 from services.gateway.storage import on_storage
 
 T = TypeVar("T", bound=Document)
@@ -36,6 +36,7 @@ SANDBOX = (
 """For reports, which somebody may have put there who can write to shared storage alone: no script,
 no form, nothing from anywhere. Of the same origin, so that their links bring the cookie along."""
 
+Skip = Annotated[int, Query(ge=0, le=LOOKED, description="Recordings before the page.")]
 router = APIRouter(include_in_schema=False)
 
 
@@ -81,8 +82,17 @@ async def recordings(request: Request) -> Response:
     if (user := asking(request)) is None:
         return login()
     shelves = _shelves(request)
-    told = [(name, *await on_storage(shelves.listed, name)) for name in shelves.folders]
+    told = [await on_storage(shelves.listed, name) for name in shelves.folders]
     return page("recordings.html", request, user, shelves=told)
+
+
+@router.get("/recordings/{shelf:name}")
+async def shelf_of_recordings(request: Request, shelf: str, skip: Skip = 0) -> Response:
+    """The recordings of a folder, a page at a time."""
+    if (user := asking(request)) is None:
+        return login()
+    told = await on_storage(_shelves(request).listed, shelf, skip)
+    return page("recordings.html", request, user, shelves=[told])
 
 
 @router.get("/recordings/{shelf:name}/{name:path}")
@@ -227,13 +237,15 @@ def _counted(states: Iterable[str]) -> str:
 
 
 def _recordings_tile(shelves: Shelves) -> Tile:
-    found, robots, more = 0, Counter[str](), False
-    for name in shelves.folders:
-        listed, left = shelves.listed(name)
-        found, more = found + len(listed), more or left
-        robots.update(r.header.metadata["robot"] for r in listed if r.header)
+    robots = Counter[str]()
+    told = [shelves.listed(name) for name in shelves.folders]
+    for listing in told:
+        robots.update(r.header.metadata["robot"] for r in listing.shown if r.header)
     named = ", ".join(f"{count} of {robot}" for robot, count in robots.most_common(5))
-    return Tile("Recordings", "/recordings", f"{found}{' and more' if more else ''}", named)
+    total, shown = sum(one.total for one in told), sum(one.end for one in told)
+    count = f"{total}{'' if all(one.all_found for one in told) else ' or more'}"
+    newest = named if shown == total else f"of {shown} looked at: {named}"
+    return Tile("Recordings", "/recordings", count, newest)
 
 
 def _tile(kind: Kind[T], found: Sequence[Artefact[T]]) -> Tile:

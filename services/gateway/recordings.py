@@ -16,7 +16,7 @@ from services.gateway.storage import on_storage
 from services.job_folder import below, inside
 
 LISTED = 500
-"""Recordings of a folder that are listed."""
+"""Recordings of a folder on a page of their list."""
 LOOKED = 20_000
 """Files of a folder that are looked at."""
 CELLS = 4_000_000
@@ -39,6 +39,35 @@ class Listed:
     trouble: str = ""
 
 
+@dataclass(frozen=True)
+class Listing:
+    """A page of the list of a shelf's recordings.
+
+    Attributes:
+      shelf: its name.
+      shown: the recordings of the page.
+      skipped: how many come before them.
+      total: how many were found.
+      all_found: whether there are no more than these, for only so many files are looked at.
+    """
+
+    shelf: str
+    shown: list[Listed]
+    skipped: int
+    total: int
+    all_found: bool
+
+    @property
+    def end(self) -> int:
+        """How many come before the page and on it."""
+        return self.skipped + len(self.shown)
+
+    @property
+    def count(self) -> str:
+        """How many there are, in words."""
+        return f"{self.total}{'' if self.all_found else ' or more'}"
+
+
 class Shelves:
     """Folders of recordings.
 
@@ -50,11 +79,21 @@ class Shelves:
         self.folders = folders
         self._drawing = asyncio.Semaphore(1)
 
-    def listed(self, shelf: str) -> tuple[list[Listed], bool]:
-        """Recordings of a shelf by name, and whether there are more."""
-        files = islice(below(self._folder(shelf)), LOOKED)
-        found = [(name, path) for name, path in files if name.endswith(SUFFIX)]
-        return [_listed(name, path) for name, path in found[:LISTED]], len(found) > LISTED
+    def listed(self, shelf: str, skipped: int = 0) -> Listing:
+        """Recordings of a shelf by name, a page of them.
+
+        Args:
+          shelf: its name.
+          skipped: recordings before the page; the first one is shown where there are no more.
+
+        Raises:
+          UnknownError: there is no such shelf.
+        """
+        files = below(self._folder(shelf))
+        found = [(name, path) for name, path in islice(files, LOOKED) if name.endswith(SUFFIX)]
+        skipped = skipped if skipped < len(found) else 0
+        shown = [_listed(name, path) for name, path in found[skipped : skipped + LISTED]]
+        return Listing(shelf, shown, skipped, len(found), next(files, None) is None)
 
     def file(self, shelf: str, name: str) -> Path:
         """A recording's file.
