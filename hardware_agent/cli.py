@@ -19,7 +19,7 @@ from pup.files import MISTAKES
 from pup.usage import Usage
 
 DONE, FAILED, REFUSED = 0, 1, 2
-PLACE = "/etc/pup-agent/agent.toml"
+PLACE, VARIABLE = "/etc/pup-agent/agent.toml", "PUP_AGENT_CONFIG"
 SCRIPTS = "file of `pup record --scripts`, or a folder of them, played in the order of their names"
 SETUP = "what was changed on the robot, by its knobs; kept with the recordings"
 MOST = 100  # repeats of a script
@@ -45,8 +45,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    whole = Usage(prog="pup-agent", description="Runs trials on a robot, and keeps it whole.")
-    place = os.environ.get("PUP_AGENT_CONFIG", PLACE)
+    whole = Usage(
+        prog="pup-agent",
+        description="Runs trials on a robot, and keeps it whole.",
+        epilog=f"Without --config, the file that the variable {VARIABLE} names is used, or {PLACE}. "
+        "`pup-agent VERB --help` tells the options of a verb.",
+    )
+    place = os.environ.get(VARIABLE, PLACE)
     verbs = whole.add_subparsers(required=True, dest="verb", metavar="VERB")
     for name, told in (
         ("run", "run the agent; the robot does not move until it is enabled"),
@@ -63,7 +68,11 @@ def _parser() -> argparse.ArgumentParser:
     ):
         verb = verbs.add_parser(name, help=told, description=f"{told[0].upper()}{told[1:]}.")
         verb.add_argument(
-            "--config", type=Path, default=Path(place), metavar="FILE", help="default: %(default)s"
+            "--config",
+            type=Path,
+            default=Path(place),
+            metavar="FILE",
+            help=f"default: the variable {VARIABLE}, or {PLACE}; now %(default)s",
         )
         if name == "health":
             verb.add_argument("--json", action="store_true", help="print one JSON object")

@@ -1,5 +1,8 @@
 """`agent.toml`: every mistake is told in one line, and `pup-agent` exits with 2."""
 
+import os
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -183,3 +186,25 @@ def test_keys_are_made_once_and_secret(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file/journal: cannot be written"):
         Journal(tmp_path / "file" / "journal")
     assert (tmp_path / "keys" / "op2.key_secret").stat().st_mode & 0o077 == 0
+
+
+def test_help_tells_of_the_variable_and_it_is_heeded(tmp_path: Path) -> None:
+    """A process of its own: the variable is read where one starts."""
+    file = tmp_path / "100%.toml"
+    file.write_text(WHOLE.replace("schema = 1", "schema = 9"))
+
+    def told(*arguments: str) -> tuple[int, str]:
+        done = subprocess.run(
+            [sys.executable, "-m", "hardware_agent.cli", *arguments],
+            env=os.environ | {"PUP_AGENT_CONFIG": str(file), "COLUMNS": "300"},
+            capture_output=True,
+            text=True,
+            timeout=100,
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    assert told("health")[0] == 2 and str(file) in told("health")[1]
+    for asked in (["--help"], ["health", "--help"]):
+        code, text = told(*asked)
+        assert code == 0 and "PUP_AGENT_CONFIG" in text and "/etc/pup-agent/agent.toml" in text
+    assert f"now {file}" in text
