@@ -2,13 +2,14 @@
 #   make run    the main job; RECORDINGS=DIR ROBOT=NAME take your own data, FORMAT=NAME imports it
 #               first (csv, mcap, darwin-hardware, ...), ARGS=... passes options on
 #   make test   linters, types, import rules and the tests
+# and `make install` for the set-up of the first alone: `pup` and `pup-agent` in .venv/bin.
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 ROBOT ?= darwin_op2
 
-.PHONY: run test slow lint docs clean
+.PHONY: install run test slow lint docs clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -19,6 +20,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 $(VENV)/.tested: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,brax]'
 	touch $@
+
+install: $(VENV)/.installed
 
 IMPORTED := $(if $(FORMAT),$(OUT)/recordings,$(RECORDINGS))
 
