@@ -48,8 +48,8 @@ def _parser() -> argparse.ArgumentParser:
     whole = Usage(
         prog="pup-agent",
         description="Runs trials on a robot, and keeps it whole.",
-        epilog=f"Without --config, the file that the variable {VARIABLE} names is used, or {PLACE}. "
-        "`pup-agent VERB --help` tells the options of a verb.",
+        epilog=f"Without --config, the file that the variable {VARIABLE} names is used, or "
+        f"{PLACE}. `pup-agent VERB --help` tells the options of a verb.",
     )
     place = os.environ.get(VARIABLE, PLACE)
     verbs = whole.add_subparsers(required=True, dest="verb", metavar="VERB")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.nominal import FREE as FITTED_BY_DIAGNOSIS
 from pup.errors import InputError
+from pup.files import read_json
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.terms import split_column
 from pup.recording import Recording
@@ -69,7 +70,8 @@ def identify(
       threads: cores for the replays made in this process.
 
     Raises:
-      InputError: there is nothing to fit, a checkpoint is of another fit, or the start is not one.
+      InputError: there is nothing to fit, a checkpoint is of another fit, the folder has bounds of
+        another torque law, or the start is not one.
     """
     job = _Job(robot, tuple(recordings), options, out, runner, progress, threads)
     return job.run()
@@ -88,6 +90,7 @@ class _Job:
     ) -> None:
         check_folds(recordings, options.folds)
         options.check(recordings)
+        _check_place(out / "bounds.json", options.actuator)
         self.robot, self.recordings, self.options = robot, recordings, options
         self.out, self.runner, self.progress, self.threads = out, runner, progress, threads
         compare = options.compare and not options.as_described  # a diagnosis knows one law
@@ -341,6 +344,19 @@ class _Job:
             "versions": {p: version(p) for p in packages} | {"python": platform.python_version()},
             "seconds": round(seconds, 1),
         }
+
+
+def _check_place(file: Path, actuator: Actuator) -> None:
+    """Refuse to put bounds of one torque law in the place of another's, which took as long."""
+    try:
+        kind = read_json(file)["actuator"]["kind"]
+    except (InputError, LookupError, TypeError):  # there is none, or it is something else
+        return
+    if kind != actuator:
+        raise InputError(
+            f"{file}: of the {kind} torque law; use another --out for that of {actuator}, or move "
+            "it away"
+        )
 
 
 def _movable(space: ParameterSpace) -> list[str]:

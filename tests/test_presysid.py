@@ -14,7 +14,7 @@ from pup.errors import InputError
 from pup.files import read_json, write_json
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
-from pup.robot import RobotDescription, TermSpec
+from pup.robot import Actuator, RobotDescription, TermSpec
 from pup.robot_writer import write_corrected
 from pup.sysid import problem as problems
 from pup.sysid.fit import FitResult
@@ -150,6 +150,30 @@ def test_recordings_longer_than_the_memory_are_refused_before_any_fit(
     with pytest.raises(InputError, match="give fewer or shorter recordings"):
         job.run()
     assert not runner.fits
+
+
+def test_bounds_of_another_torque_law_are_not_replaced(tmp_path: Path) -> None:
+    """A user compares both: the second would be in the place of the first."""
+    bench = RobotDescription.load("servo_bench")
+    run = stepped(
+        "a",
+        "bench",
+        robot="servo_bench",
+        joints=("servo",),
+        target=np.full((TICKS, 1), 0.1),
+        position=0.1 * np.linspace(0, 1, TICKS)[:, None],
+    )
+
+    def found(actuator: Actuator) -> Bounds:
+        asked = Options(actuator, subsets=2, compare=False, fixed_network=True)
+        return job_of(bench, (run,), tmp_path, asked)[0].run()
+
+    first = found("pd")
+    kept = (tmp_path / "bounds.json").read_bytes()
+    with pytest.raises(InputError, match=r"of the pd torque law; use another --out for .* nn_pd"):
+        found("nn_pd")
+    assert (tmp_path / "bounds.json").read_bytes() == kept
+    assert found("pd").document()["parameters"] == first.document()["parameters"]
 
 
 def test_a_subset_that_sees_nothing_is_not_searched(
