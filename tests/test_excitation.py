@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from pup.errors import InputError
+from pup.physics.model import joint_units
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import robot_space
 from pup.recording import Recording
 from pup.robot import RobotDescription, built_in_robots
 from pup.sysid.clearance import Clearance
-from pup.sysid.excitation import Motion, joint_units, possible_kinds, script
+from pup.sysid.excitation import Motion, possible_kinds, script
 from pup.sysid.lean import falling_pose
 from pup.sysid.virtual import record
 

@@ -1,16 +1,20 @@
 """Where a replay starts: the mean of a robot that rests on the ground, else its first reading."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from biped import biped
 from numpy.typing import NDArray
 from recordings import make
 
+from pup.physics.groups import group_of
 from pup.physics.model import compile_model, first_tilt
 from pup.physics.rest import ticks_at_rest
 from pup.physics.simulator import schedule
 from pup.recording import Recording
 from pup.robot import RobotDescription
+from pup.sysid.loss import ReplayLoss
 
 REST, TICKS = 15, 40
 NOISE = 0.002  # rad
@@ -63,6 +67,42 @@ def test_a_robot_that_moves_from_the_start_has_no_rest() -> None:
     recording = resting("ground")
     sinking = recording.position - 0.05 * np.linspace(0, 1, TICKS)[:, None] * [1, 0]
     assert ticks_at_rest(replace(recording, position=sinking)) == 1
+
+
+def hopper(folder: Path) -> RobotDescription:
+    """The biped with legs that slide by 0.02 m in all."""
+    biped(folder)
+    for name, told in (
+        ("model.xml", {'range="-1 1"': 'type="slide" range="-0.01 0.01"'}),
+        ("robot.toml", {"-0.8": "-0.01", "0.8": "0.01", "[0.1]": "[0.005]"}),
+    ):
+        text = (folder / name).read_text()
+        for old, new in told.items():
+            text = text.replace(old, new)
+        (folder / name).write_text(text)
+    return RobotDescription.load(folder)
+
+
+def test_a_slide_drifts_by_less_than_a_hinge(tmp_path: Path) -> None:
+    """One that sinks by 0.1 mm of 20 rests no more than one whose hinges turn by a degree."""
+    robot = hopper(tmp_path)
+    noise = np.random.default_rng(0).normal(0, 1e-6, (TICKS, 2))
+    still = replace(
+        resting("ground"),
+        robot=robot.name,
+        motion="stand",
+        joints=robot.joint_names,
+        target=0.01 * resting("ground").target,
+        position=noise,
+    )
+    sinks = replace(still, position=noise - np.linspace(0, 2e-4, TICKS)[:, None])
+    loss = ReplayLoss(robot, [still, sinks])
+    assert loss.rests == (slice(REST // 2, REST), None)
+    group = group_of(robot, [still, sinks], "ground", loss.ticks)
+    assert dict(zip(group.members, group.rests, strict=True)) == {0: True, 1: False}
+    begun = dict(zip(group.members, group.start[:, group.model.qpos], strict=True))
+    np.testing.assert_allclose(begun[0], noise[:REST].mean(axis=0))
+    np.testing.assert_array_equal(begun[1], sinks.position[0])
 
 
 def test_a_command_at_once_leaves_no_rest() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pup.physics.commands import Commands
 from pup.physics.encoders import Event
-from pup.physics.model import Model, compile_model, first_tilt, standing_qpos
+from pup.physics.model import Model, compile_model, first_tilt, named_units, standing_qpos
 from pup.physics.rest import ticks_at_rest
 from pup.physics.simulator import Schedule, schedule
 from pup.recording import Recording
@@ -62,7 +62,8 @@ def group_of(
     """
     members = [i for i, r in enumerate(recordings) if r.support == support]
     model = compile_model(robot, support)
-    plans = {i: schedule(recordings[i], robot.joint_names, robot.timestep) for i in members}
+    units = named_units(robot)
+    plans = {i: schedule(recordings[i], robot.joint_names, robot.timestep, units) for i in members}
     members.sort(key=lambda i: -plans[i].steps)
     ordered = [plans[i] for i in members]
     steps = ordered[0].steps
@@ -83,7 +84,7 @@ def group_of(
         power=np.ascontiguousarray(power),
         running=np.sum([np.arange(steps) < p.steps for p in ordered], axis=0),
         events=_events(ordered, [ticks[i].start for i in members], steps),
-        rests=np.array([ticks_at_rest(recordings[i]) > 1 for i in members]),
+        rests=np.array([ticks_at_rest(recordings[i], units) > 1 for i in members]),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.physics.rest import at_rest, ticks_at_rest
+from pup.physics.rest import Units, at_rest, ticks_at_rest
 from pup.physics.rotations import CONJUGATE, multiply
 from pup.physics.stopwatch import put_away
 from pup.recording import Recording
@@ -275,7 +275,7 @@ def starting_qpos(
 
 def first_tilt(robot: RobotDescription, model: Model, recording: Recording) -> Array:
     """The torso's orientation by the IMU's roll and pitch at the start, (4,); NaN without them."""
-    ticks = ticks_at_rest(recording)
+    ticks = ticks_at_rest(recording, named_units(robot))
     roll, pitch = (
         _first_known(recording.extras.get(f"imu/{angle}"), ticks) for angle in ("roll", "pitch")
     )
@@ -310,6 +310,24 @@ def mount(robot: RobotDescription, model: Model) -> Array:
         turn = multiply(compiled.body_quat[body], turn)
         body = int(compiled.body_parentid[body])
     return turn
+
+
+def joint_units(robot: RobotDescription) -> Array:
+    """What stands for a radian in each joint: 1 in a hinge, a share of a slide's range (m).
+
+    Shape (n_joints,).
+    """
+    model = compile_model(robot, "suspended" if robot.floating else "bench").compiled
+    lower, upper = robot.limits
+    slides = [
+        model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in robot.joint_names
+    ]
+    return np.asarray(np.where(slides, (upper - lower) / np.pi, 1.0), dtype=np.float64)
+
+
+def named_units(robot: RobotDescription) -> Units:
+    """The same by the joints' names."""
+    return dict(zip(robot.joint_names, joint_units(robot).tolist(), strict=True))
 
 
 def standing_qpos(robot: RobotDescription, model: Model, position: Array, torso: Array) -> Array:

@@ -4,29 +4,35 @@ On the ground a start's noise does not die out as it does where a fixed torso ho
 grows with every impact, and a fit pays for it with parameters. Most motions begin at rest.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.recording import Recording
 
 Array = NDArray[np.float64]
+Units = Mapping[str, float]
 
+HINGES: Units = {}
+"""Units of a robot whose joints all turn."""
 FEWEST = 4
 """Ticks of rest worth a mean: two in each half that are compared."""
 DRIFT = 0.004
 """By how much the means of a rest's halves may differ, rad: less than three steps of a 12-bit
-encoder. What drifts less is hardly misread by its mean."""
+encoder. What drifts less is hardly misread by its mean. Of a slide, what stands for it."""
 MEDIAN_OF_DIFFERENCES = 0.954
 """Of two normal variables, in absolute value, for a standard deviation of one."""
 CHANCE = 3.0
 """Standard errors that they may differ by besides."""
 
 
-def ticks_at_rest(recording: Recording) -> int:
+def ticks_at_rest(recording: Recording, units: Units = HINGES) -> int:
     """Ticks at the beginning in which a robot on the ground is told nothing and does not move.
 
     Args:
       recording: its targets tell how long nothing is asked, its readings whether nothing happens.
+      units: what stands for a radian in its joints, by name; 1 where it is not told.
 
     Returns:
       Their number; 1 where the robot hangs, where the first reading alone must do, or where it
@@ -37,7 +43,8 @@ def ticks_at_rest(recording: Recording) -> int:
     moved = (recording.target[1:] != recording.target[:-1]) & ~np.isnan(recording.target[1:])
     asked = moved.any(axis=1)
     still = int(np.argmax(asked)) + 1 if asked.any() else len(recording.time)
-    readings = np.column_stack([recording.position, *_tilts(recording)])[:still]
+    position = recording.position / [units.get(name, 1.0) for name in recording.joints]
+    readings = np.column_stack([position, *_tilts(recording)])[:still]
     judged = [column for column in readings.T if _tells(column)]
     if not judged or any(_drifts(column) for column in judged):
         return 1

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.parameters import Candidates
-from pup.physics.rest import at_rest, ticks_at_rest
+from pup.physics.rest import HINGES, Units, at_rest, ticks_at_rest
 from pup.recording import Recording
 
 Array = NDArray[np.float64]
@@ -52,13 +52,16 @@ class Schedule:
         return len(self.power)
 
 
-def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Schedule:
+def schedule(
+    recording: Recording, joints: Sequence[str], timestep: float, units: Units = HINGES
+) -> Schedule:
     """Put a recording on a sub-step grid.
 
     Args:
       recording: its commands are held from row to row; a missing one holds the one before.
       joints: the order of the joints.
       timestep: sub-step, s.
+      units: see `ticks_at_rest`.
     """
     order = [recording.joints.index(name) for name in joints]
     elapsed = recording.time - recording.time[0]
@@ -72,7 +75,7 @@ def schedule(recording: Recording, joints: Sequence[str], timestep: float) -> Sc
         time=elapsed,
         held=target,
         power=_mean_over_steps(elapsed, power, grid)[:, 0],
-        start=_start(recording, order, target),
+        start=_start(recording, order, target, units),
         start_velocity=np.nan_to_num(np.array(speeds)),
         tick_step=step,
         tick_fraction=np.clip(where - step - 1e-9, 0.0, 1.0),
@@ -88,14 +91,14 @@ def _held(values: Array) -> Array:
     return np.asarray(np.take_along_axis(values, np.maximum(rows, first), axis=0))
 
 
-def _start(recording: Recording, order: Sequence[int], target: Array) -> Array:
+def _start(recording: Recording, order: Sequence[int], target: Array, units: Units) -> Array:
     """Positions to start from, shape (n_joints,): the mean of a rest, or the first ones.
 
     Where the first reading is missing, the next one counts as long as no target has changed
     before it; else the joint stood at its first target.
     """
     position = recording.position[:, order]
-    resting = at_rest(position, ticks_at_rest(recording))
+    resting = at_rest(position, ticks_at_rest(recording, units))
     read = np.argmax(~np.isnan(position), axis=0)
     joints = np.arange(position.shape[1])
     moved = np.argmax(

@@ -11,12 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.errors import InputError
-from pup.physics.model import compile_model
+from pup.physics.model import joint_units
 from pup.robot import RobotDescription
 from pup.sysid.clearance import Clearance
 from pup.sysid.lean import DIRECTIONS, falling_pose
@@ -142,19 +141,6 @@ def script(
         )
         seen[label] += 1
     return tuple(motions)
-
-
-def joint_units(robot: RobotDescription) -> Array:
-    """What stands for a radian in each joint: 1 in a hinge, a share of a slide's range (m).
-
-    Shape (n_joints,).
-    """
-    model = compile_model(robot, "suspended" if robot.floating else "bench").compiled
-    lower, upper = robot.limits
-    slides = [
-        model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in robot.joint_names
-    ]
-    return np.asarray(np.where(slides, (upper - lower) / np.pi, 1.0), dtype=np.float64)
 
 
 def _variants(robot: RobotDescription, kind: str) -> list[tuple[str, str, _Make]]:

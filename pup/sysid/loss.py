@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.rest import ticks_at_rest
+from pup.physics.model import joint_units
+from pup.physics.rest import Units, ticks_at_rest
 from pup.physics.simulator import Trajectories, tick_slices
 from pup.recording import Recording
 from pup.robot import RobotDescription
-from pup.sysid.excitation import joint_units
 
 Array = NDArray[np.float64]
 
@@ -74,8 +74,9 @@ class ReplayLoss:
         measured = [not np.isnan(self.tilt[part]).all() for part in self.ticks]
         self.tilting = ground & moving & np.array(measured)
         self.starts = np.array([part.start for part in self.ticks])
+        named = dict(zip(robot.joint_names, self.units, strict=True))
         self.rests = tuple(
-            _rest(r, part.start) for r, part in zip(recordings, self.ticks, strict=True)
+            _rest(r, part.start, named) for r, part in zip(recordings, self.ticks, strict=True)
         )
 
     @property
@@ -217,9 +218,9 @@ def _tilt(recording: Recording) -> Array:
     return np.stack(angles, axis=1)
 
 
-def _rest(recording: Recording, start: int) -> slice | None:
+def _rest(recording: Recording, start: int, units: Units) -> slice | None:
     """Ticks of the second half of a rest at the beginning, when a replay has settled, or None."""
-    ticks = ticks_at_rest(recording)
+    ticks = ticks_at_rest(recording, units)
     return slice(start + ticks // 2, start + ticks) if ticks > 1 else None
 
 

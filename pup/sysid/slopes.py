@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.rest import ticks_at_rest
+from pup.physics.model import named_units
+from pup.physics.rest import Units, ticks_at_rest
 from pup.recording import Recording
-from pup.sysid.excitation import joint_units
 from pup.sysid.gauss_newton import differences
 from pup.sysid.polish import STEP
 from pup.sysid.problem import Problem
@@ -138,22 +138,21 @@ def _starts(problem: Problem, unit: Array, error: Array) -> list[Array]:
     Recordings do not meet: all of them start otherwise at once.
     """
     robot = problem.robot
-    noise = {
-        name: READING * u for name, u in zip(robot.joint_names, joint_units(robot), strict=True)
-    }
+    units = named_units(robot)
+    noise = {name: READING * units[name] for name in robot.joint_names}
     if problem.loss.tilting.any():
         noise |= {name: TILT_READING for name in ("imu/roll", "imu/pitch")}
     told = []
     for name, sd in noise.items():
-        moved = tuple(_moved(recording, name, sd) for recording in problem.recordings)
+        moved = tuple(_moved(recording, name, sd, units) for recording in problem.recordings)
         changed = replace(problem, recordings=moved).errors(unit[None])[0][0]
         told.append(changed - error)
     return told
 
 
-def _moved(recording: Recording, name: str, by: float) -> Recording:
+def _moved(recording: Recording, name: str, by: float, units: Units) -> Recording:
     """A recording with the reading of a joint or of the IMU moved that its replay starts from."""
-    ticks = ticks_at_rest(recording)
+    ticks = ticks_at_rest(recording, units)
     by /= np.sqrt(ticks)
     if name in recording.joints:
         position = recording.position.copy()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pup.errors import InputError
 from pup.files import read_json, write_json
+from pup.physics.model import joint_units
 from pup.physics.mujoco_batch import MujocoSimulator
 from pup.physics.parameters import NETWORK_NAMES, ParameterSpace, robot_space
 from pup.physics.simulator import Trajectories
@@ -21,7 +22,7 @@ from pup.recording import Recording, write_recordings
 from pup.recording_file import read_header
 from pup.robot import RobotDescription
 from pup.script import FALLEN
-from pup.sysid.excitation import Motion, joint_units, script
+from pup.sysid.excitation import Motion, script
 from pup.sysid.result import read_fitted
 
 Array = NDArray[np.float64]
