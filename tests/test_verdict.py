@@ -264,6 +264,17 @@ def test_two_forms_of_one_class_at_one_place_are_one_cause_that_is_either() -> N
     assert shared(unlike) == unlike
 
 
+def test_of_two_forms_of_one_class_the_usual_one_is_likelier_and_first() -> None:
+    """A third as likely is friction that rises at rest, however much of the two's error it has."""
+    rising = found("rising_static_friction", 900.0, 1.0, 0.96)
+    stribeck, ripple = found("stribeck_friction", 300.0, 1.0, 0.88), found("cogging", 400.0, 1.0)
+    told = in_order(shared([rising, ripple, stribeck]))
+    assert [f.effect for f in told] == ["stribeck_friction", "cogging", "rising_static_friction"]
+    assert told[0].probability == pytest.approx(0.66, abs=0.01)
+    assert told[0].of_class == pytest.approx(0.88) and told[2].of_class == pytest.approx(0.96)
+    assert told[2].equivalents[0].probability == pytest.approx(0.72, abs=0.01)
+
+
 def test_an_interval_is_as_wide_as_a_law_of_another_form_asks() -> None:
     torque = next(q for q in TERMS["coulomb_friction"].quantities if not q.shape)
     sharp = of_other_form(Parameter(0.1, "N m", 0.0999, 0.1001), torque)

@@ -177,17 +177,25 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
     """Findings, those of one class at one place each a rival of the other.
 
     What takes two forms of a class at one place acts in neither of them but in one of its own, and
-    nobody can say which of the two that is nearer to.
+    nobody can say which of the two that is nearer to: the usual one, more often than not.
     """
     told = []
     for finding in found:
         kin = [f for f in found if _cause(f) == _cause(finding)]
         known = {e.effect for e in finding.equivalents}
         others = [f for f in kin if f is not finding and f.effect not in known]
-        share = finding.probability / (1 + len(others))
-        more = tuple(Alternative(f.effect, f.place, share, f.seat) for f in others)
-        told.append(replace(finding, probability=share, equivalents=more + finding.equivalents))
+        usual = np.exp([-rarity(f.effect) for f in (finding, *others)])
+        own, *rest = (float(p) for p in finding.probability * usual / usual.sum())
+        more = tuple(
+            Alternative(f.effect, f.place, p, f.seat) for f, p in zip(others, rest, strict=True)
+        )
+        told.append(replace(finding, probability=own, equivalents=more + finding.equivalents))
     return told
+
+
+def rarity(effect: str) -> float:
+    """As of its term; 0 of what is none."""
+    return TERMS[effect].rarity if effect in TERMS else 0.0
 
 
 def _cause(finding: Finding | Alternative) -> tuple[object, Place]:
@@ -199,8 +207,9 @@ def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
 
     Beside an effect of a usual size, those of which every robot has a little come after, though
     more of the error is theirs (a clock that is off by a little moves everything), unless nearly
-    all of it is. What has no name is first only where it is surer than the first that has one: a
-    torque that may be anything explains the most.
+    all of it is. Of two forms of one class at one place the likelier is first. What has no name is
+    first only where it is surer than the first that has one: a torque that may be anything explains
+    the most.
     """
     usual = [f for f in found if f.effect != NAMELESS and f.believed and f.size >= SLIGHT]
     most = max((f.gain for f in usual), default=np.inf)
@@ -209,6 +218,10 @@ def in_order(found: Sequence[Finding]) -> tuple[Finding, ...]:
         return bool(usual) and finding.size < SLIGHT and finding.gain < DOMINANT * most
 
     ordered = sorted(found, key=lambda f: (slight(f), -f.gain))
+    for i, finding in enumerate(ordered):
+        kin = [j for j in range(i, len(ordered)) if _cause(ordered[j]) == _cause(finding)]
+        likeliest = max(kin, key=lambda j: ordered[j].probability)
+        ordered[i], ordered[likeliest] = ordered[likeliest], finding
     named = next((f for f in ordered if f.effect != NAMELESS), None)
     if named and named.probability >= ordered[0].probability and ordered[0].effect == NAMELESS:
         ordered.remove(named)
