@@ -74,8 +74,14 @@ def test_a_robot_whose_servo_has_shut_down_is_mended_by_hand(tmp_path: Path) -> 
             time.sleep(1.0)
             return state() == "fault"
 
+        def mended() -> bool:
+            """Whether it stays so: a busy computer may hold its loop up, which is a fault too."""
+            laboratory.tend()
+            for _ in range(20):
+                if state() != "enabled":
+                    return False
+                time.sleep(0.05)
+            return True
+
         wait(shut_down, 60)
-        laboratory.tend()
-        for _ in range(20):
-            assert state() == "enabled"
-            time.sleep(0.05)
+        wait(mended, 60)
