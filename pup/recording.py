@@ -8,7 +8,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -332,6 +332,19 @@ def originals(recordings: Sequence[Recording]) -> list[str]:
     return [first(recording.id) for recording in recordings]
 
 
+def check_distinct(recordings: Iterable[Recording]) -> None:
+    """Refuse two recordings of one id: a file of its name would hold one of them.
+
+    Raises:
+      InputError: an id stands twice.
+    """
+    seen: set[str] = set()
+    for recording in recordings:
+        if recording.id in seen:
+            raise InputError(f"two recordings have the id {recording.id!r}; each needs its own")
+        seen.add(recording.id)
+
+
 def write_recordings(recordings: Sequence[Recording], folder: Path) -> tuple[Path, ...]:
     """Write recordings into a folder, named by their ids: all of them or, on an error, none.
 
@@ -345,11 +358,7 @@ def write_recordings(recordings: Sequence[Recording], folder: Path) -> tuple[Pat
     Raises:
       InputError: an id stands twice, as of two cuts that begin together.
     """
-    seen: set[str] = set()
-    for recording in recordings:
-        if recording.id in seen:
-            raise InputError(f"two recordings have the id {recording.id!r}; each needs its own")
-        seen.add(recording.id)
+    check_distinct(recordings)
     folder.mkdir(parents=True, exist_ok=True)
     files = tuple(folder / f"{recording.id}.parquet" for recording in recordings)
     with TemporaryDirectory(dir=folder, prefix=".new-") as new:

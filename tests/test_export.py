@@ -319,7 +319,7 @@ def test_a_data_set_is_of_one_robot_and_never_written_over(tmp_path: Path) -> No
 def test_two_recordings_of_one_id_are_refused(tmp_path: Path, format: str) -> None:
     """Of robots of their own, as a notebook may hold them: one file would hold but one of them."""
     folder = tmp_path / "new"
-    with pytest.raises(InputError, match="2 recordings have the id 'full'; give each its own"):
+    with pytest.raises(InputError, match="two recordings have the id 'full'; each needs its own"):
         export(format, folder, FULL, make(), replace(FULL, robot="leg"))
     assert not folder.exists()
 

@@ -29,12 +29,12 @@ SHARES = (1.0, 0.4)
 DAMPED, FURTHEST = 0.01, 0.5
 """Damping and reach of the step that the other coordinates may take with it."""
 PUZZLING, GLARING = 0.5, 30.0
-"""Where the best of all effects leaves this share of what is more than noise, or so many times the
-noise, they are begun elsewhere too: the right one may have stopped halfway, as a gear's friction
-that all but holds its joint."""
+"""A search that leaves this share of what is more than noise has explained little; where the best
+of all effects leaves so many times the noise, they are begun elsewhere too: the right one may have
+stopped halfway, as a gear's friction that all but holds its joint."""
 DRIVEN = 0.2
-"""The same share where parameters were driven so far off that the described robot is looked
-at too: beside a torque limit of a quarter an armature explained 63 % of a lag."""
+"""So they are where it leaves this share and parameters were driven so far off that the described
+robot is looked at too: beside a torque limit of a quarter an armature explained 63 % of a lag."""
 LOUD = 6.0
 """A fit that leaves so many times the noise may have stopped anywhere, or lacks much."""
 LIMB = 6

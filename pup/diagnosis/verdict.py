@@ -184,7 +184,7 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
         kin = [f for f in found if _cause(f) == _cause(finding)]
         known = {e.effect for e in finding.equivalents}
         others = [f for f in kin if f is not finding and f.effect not in known]
-        usual = np.exp([-rarity(f.effect) for f in (finding, *others)])
+        usual = np.exp([-_rarity(f.effect) for f in (finding, *others)])
         own, *rest = (float(p) for p in finding.probability * usual / usual.sum())
         more = tuple(
             Alternative(f.effect, f.place, p, f.seat) for f, p in zip(others, rest, strict=True)
@@ -193,7 +193,7 @@ def shared(found: Sequence[Finding]) -> list[Finding]:
     return told
 
 
-def rarity(effect: str) -> float:
+def _rarity(effect: str) -> float:
     """As of its term; 0 of what is none."""
     return TERMS[effect].rarity if effect in TERMS else 0.0
 

@@ -1,7 +1,6 @@
 """Recordings, with or without their replays, as files of other programs: a module per format."""
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from pup.errors import InputError, how_to_install
 from pup.exporters.common import Take
+from pup.recording import check_distinct
 from pup.robot import RobotDescription
 
 __all__ = ["FORMATS", "Take", "export_takes"]
@@ -55,7 +55,7 @@ def export_takes(
         is not free for them.
     """
     require(format, rate)
-    _check_ids(takes)
+    check_distinct(take.recording for take in takes)
     _check_name(format, folder)
     folder.mkdir(parents=True, exist_ok=True)
     if format == "lerobot":
@@ -76,15 +76,6 @@ def export_takes(
         for file in files:
             os.replace(Path(new) / file.name, file)
     return {"files": [str(file) for file in files]}
-
-
-def _check_ids(takes: Sequence[Take]) -> None:
-    """Refuse two takes of one id: a file of its name would hold one of them."""
-    for name, count in Counter(take.recording.id for take in takes).items():
-        if count > 1:
-            raise InputError(
-                f"{count} recordings have the id {name!r}; give each its own, or export them apart"
-            )
 
 
 def _check_name(format: str, folder: Path) -> None:
