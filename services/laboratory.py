@@ -106,6 +106,8 @@ class Laboratory(AbstractContextManager["Laboratory"]):
 
     restarts = 3
     """Of each process, before the laboratory is given up."""
+    standstill = 240.0
+    """Without any change of a study, after which its processes are started anew, s."""
 
     def __init__(self, folder: Path, robot: RobotDescription, policy: Path, seed: int) -> None:
         self.folder, self.robot, self.seed = folder.absolute(), robot, seed
@@ -129,8 +131,7 @@ class Laboratory(AbstractContextManager["Laboratory"]):
     def close(self) -> None:
         """End all, the agent first, which leaves the robot limp; keys and the token go too."""
         try:
-            for name in ("agent", "robot", "gateway"):
-                self._end(name)
+            self.interrupt()
         finally:
             reaper.close(self._watch, str(self._passing))  # what is left now is killed
             shutil.rmtree(self.keys, ignore_errors=True)
@@ -152,13 +153,25 @@ class Laboratory(AbstractContextManager["Laboratory"]):
         with suppress(InputError):  # an agent or a robot that does not listen yet
             self._attend()
 
+    def interrupt(self) -> None:
+        """End all processes, whatever holds them up; who tends starts them again."""
+        for name in ("agent", "robot", "gateway"):
+            self._end(name)
+
     def _attend(self) -> None:
         state = self._agent("health")["state"]
-        if state == "fault":  # it may lie on an arm, and a servo that has shut down stays so
-            for do in ("supply", "reset"):
-                say(self._passing / "side", {"cmd": do})
+        if state == "fault":
+            self._mend()
         if state in ("disabled", "stopped", "fault"):
-            self._agent("enable")
+            try:
+                self._agent("enable")
+            except InputError:  # an agent that was started anew has seen no fault
+                self._mend()
+
+    def _mend(self) -> None:
+        """By hand: it may lie on an arm, and a servo that has shut down stays so."""
+        for do in ("supply", "reset"):
+            say(self._passing / "side", {"cmd": do})
 
     def _open(self) -> None:
         shutil.rmtree(self.keys, ignore_errors=True)

@@ -1,6 +1,7 @@
 """Post-sysID of a job: a virtual robot walks until eta is chosen, unattended (paper, section V)."""
 
 import statistics
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,16 +126,46 @@ def follow(
         "seed": budget.seed,
     }
 
+    progress = _Progress()
+
+    def care() -> None:
+        if progress.seconds_ago > laboratory.standstill:
+            told(f"nothing has changed for {laboratory.standstill:g} s; all is started anew")
+            progress.restart()
+            laboratory.interrupt()
+        laboratory.tend()
+
     def tell(line: str) -> None:
-        laboratory.tend()  # also while the gateway does not answer
+        care()  # also while the gateway does not answer
         told(line)
 
     def tend(gateway: Gateway, study: dict[str, Any]) -> None:
-        laboratory.tend()
+        progress.look(study)
+        care()
         attend(gateway, study)
 
     place = laboratory.url, laboratory.token
     return transfer(Wanted(laboratory.policy, name, *place, settings, simulated), out, tell, tend)
+
+
+class _Progress:
+    """When a study changed last."""
+
+    def __init__(self) -> None:
+        self._study: dict[str, Any] = {}
+        self.restart()
+
+    @property
+    def seconds_ago(self) -> float:
+        return time.monotonic() - self._at
+
+    def restart(self) -> None:
+        self._at = time.monotonic()
+
+    def look(self, study: dict[str, Any]) -> None:
+        if study != self._study:
+            self._study = study
+            self.restart()
 
 
 def recorded(folder: Path) -> list[Path]:

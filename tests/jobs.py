@@ -1,12 +1,13 @@
 """A `pup` that runs in a process group of its own, to be stopped and killed."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,11 +80,23 @@ class Job:
         try:
             out, err = self.process.communicate(timeout=patience)
         except subprocess.TimeoutExpired:
-            self.process.send_signal(signal.SIGABRT)  # by which it tells where its threads are
-            _, err = self.process.communicate()
-            logs = [f"{file}:\n{file.read_text()[-2000:]}" for file in self.out.rglob("*.log")]
-            raise AssertionError("\n".join([f"hangs: {err[-6000:]}", *logs])) from None
+            raise AssertionError(f"hangs: {self._whereabouts()}") from None
         return self.process.returncode, out, err
+
+    def _whereabouts(self) -> str:
+        """Where a job that hangs and its processes stand, which ends them."""
+        children = psutil.Process(self.pid).children(recursive=True)
+        self.process.send_signal(signal.SIGSTOP)  # it would start those anew that end
+        for child in children:
+            with suppress(psutil.Error):
+                child.send_signal(signal.SIGABRT)  # by which it tells where its threads are
+        psutil.wait_procs(children, timeout=10.0)
+        self.process.send_signal(signal.SIGABRT)
+        self.process.send_signal(signal.SIGCONT)
+        _, err = self.process.communicate()
+        logs = [f"{file.name}: {_threads(file.read_text())}" for file in self.out.rglob("*.log")]
+        journals = [f"{file.name}: {file.read_text()[-600:]}" for file in self.out.rglob("journal")]
+        return "\n".join([_threads(err), *logs, *journals])
 
     def left(self) -> list[str]:
         """Processes of its Ray, and its Ray's folder."""
@@ -105,6 +118,15 @@ class Job:
         while left := self.left():
             assert time.monotonic() < deadline, left
             time.sleep(0.1)
+
+
+def _threads(told: str) -> str:
+    """What a process told last, and its threads' innermost frames: CI keeps few characters."""
+    words, _, threads = told.partition("Fatal Python error")
+    lines = [words[-400:]]
+    for thread in threads.partition("Extension modules")[0].split("\n\n"):
+        lines += [re.sub(r'File ".*/(.*?)"', r"\1", line) for line in thread.splitlines()[1:8]]
+    return "\n".join(lines)
 
 
 @contextmanager

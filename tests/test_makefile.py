@@ -1,5 +1,6 @@
 """`make`'s targets do what README.md says: what would be run, without running it."""
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -10,8 +11,10 @@ ROOT = Path(__file__).parent.parent
 
 def commands(target: str, environment: Path) -> list[str]:
     """What a target would run where nothing is installed yet."""
+    outer = ("MAKEFLAGS", "MAKELEVEL", "MFLAGS")  # of the `make` that runs the tests
     done = subprocess.run(
         ["make", "--dry-run", f"VENV={environment}", target],
+        env={k: v for k, v in os.environ.items() if k not in outer},
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -1,5 +1,6 @@
 """Walks without a bus are those through it."""
 
+import signal
 import time
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from hardware_agent.virtual.fleet import Fleet
 from hardware_agent.virtual.walks import walk
 from pup.policy.bundle import NumpyPolicy
 from pup.robot import RobotDescription
+from services import laboratory as laboratories
+from services import transfer
 from services.laboratory import Laboratory, period_of
 from services.trials import Budget, follow
 
@@ -85,3 +88,26 @@ def test_a_robot_whose_servo_has_shut_down_is_mended_by_hand(tmp_path: Path) -> 
 
         wait(shut_down, 60)
         wait(mended, 60)
+
+
+@pytest.mark.parametrize("frozen", ["robot", pytest.param("gateway", marks=pytest.mark.slow)])
+def test_a_laboratory_that_stands_still_is_started_anew(
+    frozen: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that neither ends nor answers is nothing that an exit would tell of."""
+    monkeypatch.setattr(transfer, "TIMEOUT", 3.0)
+    monkeypatch.setattr(laboratories, "GRACE", 1.0)
+    lines: list[str] = []
+    with Laboratory(tmp_path, DARWIN, POLICY, SEED) as laboratory:
+        laboratory.standstill = 12.0
+        process = laboratory._processes[frozen]
+
+        def told(line: str) -> None:
+            if "trial" in line and "anew" not in " ".join(lines):
+                process.send_signal(signal.SIGSTOP)
+            lines.append(line)
+
+        study = follow(laboratory, "s", Budget(2, repeats=0, horizon=2.0), [], tmp_path / "s", told)
+    assert any("started anew" in line for line in lines)
+    assert process.poll() is not None
+    assert [t["state"] for t in study["trials"]].count("succeeded") == 2
