@@ -15,6 +15,7 @@ import psutil
 
 from workers import reaper
 
+ROOT = Path(__file__).parent.parent
 PATIENCE = 600.0
 END = 540.0
 """For a job to end, s: less than pytest has for a test, so that a job that hangs is told of."""
@@ -121,25 +122,14 @@ class Job:
 
 
 def _threads(told: str) -> str:
-    """What a process told last, and its threads' innermost frames: CI keeps few characters."""
-    words, _, threads = told.partition("Fatal Python error")
+    """What a process told last, and where its threads are in our code: CI keeps few characters."""
+    words, *ends = told.split("Fatal Python error")
     lines = [words[-400:]]
-    for thread in threads.partition("Extension modules")[0].split("\n\n"):
-        lines += [re.sub(r'File ".*/(.*?)"', r"\1", line) for line in thread.splitlines()[1:8]]
-    return "\n".join(lines)
-
-
-@contextmanager
-def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that has a folder for itself."""
-    code = "import sys; from pathlib import Path; from services.held import held\n"
-    code += "with held(Path(sys.argv[1])): print(flush=True); sys.stdin.read()"
-    command = [sys.executable, "-c", code, str(folder)]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
-        assert process.stdout is not None and process.stdout.readline()
-        yield process
-        process.kill()
+    for thread in "\n\n".join(end.partition("Extension modules")[0] for end in ends).split("\n\n"):
+        frames = [line.strip() for line in thread.splitlines() if line.startswith("  File ")]
+        ours = [line for line in frames[1:] if str(ROOT) in line and "/.venv/" not in line]
+        lines += ["thread", *frames[:1], *ours]
+    return "\n".join(lines).replace(f"{ROOT}/", "")
 
 
 def command_of(process: psutil.Process) -> list[str]:
