@@ -1,7 +1,6 @@
 """A `pup` that runs in a process group of its own, to be stopped and killed."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -119,6 +118,19 @@ class Job:
         while left := self.left():
             assert time.monotonic() < deadline, left
             time.sleep(0.1)
+
+
+@contextmanager
+def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that has a folder for itself."""
+    code = "import sys; from pathlib import Path; from services.held import held\n"
+    code += "with held(Path(sys.argv[1])): print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, str(folder)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline()
+        yield process
+        process.kill()
 
 
 def _threads(told: str) -> str:
