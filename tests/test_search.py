@@ -231,3 +231,19 @@ def test_what_a_first_look_found_is_not_lost_on_the_way_to_all_motions() -> None
         assert found.values[late] == pytest.approx(0.008, rel=0.1)
         assert found.chi2 < 1.1 * len(measured.values)
     assert lost == 2
+
+
+def test_what_makes_a_loop_swing_is_found_though_no_slope_tells_of_it() -> None:
+    """A lag with little damping: where nominal parameters went, and as described, none shows it."""
+    late = "actuator_lag/time@joint:servo"
+    truth = {late: 0.014, "actuator_lag/stages@joint:servo": 2.0, "kd/servo": 0.05}
+    runs = [shortened(recordings(truth)[i], 80) for i in (0, 2, 3)]
+    measured = Measured.of(BENCH, runs)
+    replays = Replays(measured, robot_space(BENCH, "pd"), threads(Bench(measured), 1), 1)
+    rng, samples = np.random.default_rng(0), len(measured.values)
+    nominal = certified(fit_nominal(replays, assumed_noise(measured), rng), replays, rng)
+    assert nominal.fit.chi2 > 20 * samples
+    found = search(replays, nominal, rng, lambda stage, share: None, most=1)
+    assert found is not None and [h.effect for h in found.model.hypotheses] == ["actuator_lag"]
+    assert found.model.fit.chi2 < samples
+    assert found.model.fit.values[late] == pytest.approx(0.014, rel=0.03)

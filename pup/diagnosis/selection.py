@@ -12,7 +12,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.diagnosis.beginnings import nearer
+from pup.diagnosis.beginnings import begun, nearer
 from pup.diagnosis.doubts import spare
 from pup.diagnosis.evidence import Score, Trace, foremost, scores, unimitated
 from pup.diagnosis.fit import Fit
@@ -24,7 +24,7 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.retracing import Retracer
-from pup.diagnosis.shortlist import FAINT, FURTHER, in_contact, shortlist, suspected
+from pup.diagnosis.shortlist import FAINT, FURTHER, in_contact, others, shortlist, suspected
 from pup.diagnosis.starts import (
     DRIVEN,
     LIMB,
@@ -172,10 +172,9 @@ class Selector:
         if not model.hypotheses:
             tried += self._further(model, ranking, tried)
         if not model.hypotheses and puzzling(fit, tried, DRIVEN):
-            more, elsewhere = self._elsewhere()
+            more, elsewhere = self._elsewhere(fit)
             ranked = {score.trace.hypothesis for score in ranking}
             ranking += [score for score in more if score.trace.hypothesis not in ranked]
-            self._refit(elsewhere, fit.chi2)
             tried = distinct([*tried, *elsewhere])
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         told = _remembered(model, ranking, better)
@@ -213,8 +212,13 @@ class Selector:
         start_best([f for _, f in tried], places, self.replays, self.noise)
         return tried
 
-    def _elsewhere(self) -> tuple[list[Score], list[Tried]]:
-        """Scores, and fits that begin, at the robot as it is described; see `described`."""
+    def _elsewhere(self, nominal: Fit) -> tuple[list[Score], list[Tried]]:
+        """Scores, and fits, that begin at the robot as it is described; see `described`.
+
+        Where none of these explains much, slopes tell nothing there either: what makes a loop swing
+        does so from some size on. Then all that a robot of one joint may have is fitted, to how
+        recordings begin at first: swings that are out of step lead nowhere.
+        """
         fit = described(self.nominal.fit, self.replays, self.noise)
         if fit is None:
             return [], []
@@ -222,8 +226,16 @@ class Selector:
         ranking = scores(found, unimitated(fit))
         if not ranking:
             return [], []
+        there = replace(self.nominal, fit=fit)
         chosen = shortlist(ranking, self.enough, suspected(fit, self.replays.measured))
-        return ranking, self._begun(replace(self.nominal, fit=fit), chosen)
+        tried = self._begun(there, chosen)
+        self._refit(tried, nominal.chi2)
+        if len(self.replays.measured.robot.joints) == 1 and puzzling(nominal, tried, DRIVEN):
+            more = [(h, f.fresh()) for h, f in self._begun(there, others(ranking, chosen))]
+            begun([fit for _, fit in more], self.replays, self.noise)
+            self._refit(more, nominal.chi2)
+            tried += more
+        return ranking, tried
 
     def blur(self, model: Model, least: float = FORM) -> float:
         """Chi-squared that wrong forms of a model's effects may leave."""

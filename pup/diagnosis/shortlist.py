@@ -83,3 +83,14 @@ def shortlist(
         if alike or (contact and in_contact(other)):
             best.setdefault((other.key, other.choices), score)
     return list(best.values())
+
+
+def others(ranking: Sequence[Score], chosen: Sequence[Score]) -> list[Score]:
+    """The best score of each effect, place and form that is not among those chosen."""
+    known = {(s.trace.hypothesis.key, s.trace.hypothesis.choices) for s in chosen}
+    best: dict[object, Score] = {}
+    for score in ranking:
+        one = (score.trace.hypothesis.key, score.trace.hypothesis.choices)
+        if one not in known:
+            best.setdefault(one, score)
+    return list(best.values())
