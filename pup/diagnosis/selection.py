@@ -24,7 +24,7 @@ from pup.diagnosis.models import Model, Round
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import LOST, Noise
 from pup.diagnosis.retracing import Retracer
-from pup.diagnosis.shortlist import FAINT, FURTHER, in_contact, others, shortlist, suspected
+from pup.diagnosis.shortlist import FAINT, FURTHER, in_contact, shortlist, suspected, untried
 from pup.diagnosis.starts import (
     DRIVEN,
     LIMB,
@@ -164,12 +164,13 @@ class Selector:
         if of_contact and spare(model) < self.blur(model):
             return None  # all that is left may be the form of contact that was found
         ranking = scores(self.traces.around(model), unimitated(fit))
-        if not ranking or ranking[0].surprise < self.enough:
+        shown = bool(ranking) and ranking[0].surprise >= self.enough
+        if not shown and (model.hypotheses or not glaring(fit.chi2, model.samples)):
             return None
         contact = suspected(fit, self.replays.measured)
-        tried = self._begun(model, shortlist(ranking, self.enough, contact))
+        tried = self._begun(model, shortlist(ranking, self.enough, contact)) if shown else []
         self._refit(tried, fit.chi2)
-        if not model.hypotheses:
+        if shown and not model.hypotheses:
             tried += self._further(model, ranking, tried)
         if not model.hypotheses and puzzling(fit, tried, DRIVEN):
             more, elsewhere = self._elsewhere(fit)
@@ -231,7 +232,7 @@ class Selector:
         tried = self._begun(there, chosen)
         self._refit(tried, nominal.chi2)
         if len(self.replays.measured.robot.joints) == 1 and puzzling(nominal, tried, DRIVEN):
-            more = [(h, f.fresh()) for h, f in self._begun(there, others(ranking, chosen))]
+            more = [(h, f.fresh()) for h, f in self._begun(there, untried(ranking, chosen))]
             begun([fit for _, fit in more], self.replays, self.noise)
             self._refit(more, nominal.chi2)
             tried += more

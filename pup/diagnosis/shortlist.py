@@ -85,7 +85,7 @@ def shortlist(
     return list(best.values())
 
 
-def others(ranking: Sequence[Score], chosen: Sequence[Score]) -> list[Score]:
+def untried(ranking: Sequence[Score], chosen: Sequence[Score]) -> list[Score]:
     """The best score of each effect, place and form that is not among those chosen."""
     known = {(s.trace.hypothesis.key, s.trace.hypothesis.choices) for s in chosen}
     best: dict[object, Score] = {}
