@@ -1,5 +1,9 @@
 """What the optimiser hears of a study: its walks, and the trials that gave none."""
 
+import asyncio
+import os
+import signal
+
 import pytest
 
 pytest.importorskip("botorch")
@@ -45,3 +49,30 @@ def test_whoever_resumes_after_an_overload_gets_another_eta():
     assert "away from what gave no result" in decided.why
     after = ended(study, S.SUCCEEDED)
     assert not fits.search_of(after, None).avoided and len(after.fruitless) == 2
+
+
+def stopped(known):
+    """What a process comes to, the first time, that neither ends nor goes on."""
+    if not known.exists():
+        known.touch()
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return os.getpid()
+
+
+def test_a_process_that_hangs_is_replaced(tmp_path):
+    """Whoever waits behind its fit gets an answer, too."""
+
+    async def through():
+        running = fits.Fits()
+        try:
+            await running.warm_up()
+            before, running.longest = await running.run(os.getpid), 1.0
+            hung = asyncio.create_task(running.run(stopped, tmp_path / "known"))
+            await asyncio.sleep(0.5)
+            running.longest = 60.0
+            return before, await running.run(os.getpid), await hung
+        finally:
+            running.close()
+
+    before, behind, after = asyncio.run(asyncio.wait_for(through(), 120.0))
+    assert before != behind == after

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context, parent_process
+from multiprocessing.process import BaseProcess
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -19,27 +20,38 @@ from services.gateway.records import Row
 P = ParamSpec("P")
 T = TypeVar("T")
 log = logging.getLogger(__name__)
+LONGEST = 300.0
+"""For a fit and those before it, s: one takes seconds, its process' first imports a minute where
+the machine is slow."""
 
 
 class Fits:
-    """Runs functions of `pup.transfer.optimizer` one after the other in a child process."""
+    """Runs functions of `pup.transfer.optimizer` one after the other in a child process.
 
-    def __init__(self) -> None:
-        self._pool = self._made()
+    Args:
+      longest: after which the process counts as hung, s.
+    """
+
+    def __init__(self, longest: float = LONGEST) -> None:
+        self._pool, self.longest = self._made(), longest
 
     def _made(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_begin)
 
     async def run(self, act: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
-        """Run a function of a module; once more where the process was killed meanwhile."""
+        """Run a function of a module; once more where its process was killed meanwhile, or hung."""
         for last in (False, True):
             pool = self._pool
             try:
-                return await asyncio.wrap_future(pool.submit(act, *args, **options))
-            except BrokenProcessPool:
-                log.warning("the process of the fits ended; another one is started")
+                future = asyncio.wrap_future(pool.submit(act, *args, **options))
+                return await asyncio.wait_for(future, self.longest)
+            except (BrokenProcessPool, TimeoutError) as error:
+                why = "hangs" if isinstance(error, TimeoutError) else "ended"
+                log.warning(f"the process of the fits {why}; another one is started")
                 if self._pool is pool:
                     self._pool = self._made()
+                    for child in _children(pool):  # whoever waits for it hears that it ended
+                        child.kill()
                 if last:
                     raise
         raise AssertionError
@@ -50,10 +62,14 @@ class Fits:
 
     def close(self) -> None:
         """End the process, whatever it is at."""
-        children = list((self._pool._processes or {}).values())
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        pool, children = self._pool, _children(self._pool)
+        pool.shutdown(wait=False, cancel_futures=True)
         for child in children:
-            child.terminate()
+            child.kill()
+
+
+def _children(pool: ProcessPoolExecutor) -> list[BaseProcess]:
+    return list((pool._processes or {}).values())
 
 
 def _begin() -> None:
