@@ -177,6 +177,8 @@ class Selector:
             ranked = {score.trace.hypothesis for score in ranking}
             ranking += [score for score in more if score.trace.hypothesis not in ranked]
             tried = distinct([*tried, *elsewhere])
+        if not (shown or tried):
+            return None
         better = [(h, f) for h, f in tried if fit.chi2 - f.chi2 > self.enough]
         told = _remembered(model, ranking, better)
         if not better:
