@@ -183,18 +183,22 @@ def test_killed_at_every_stage_it_ends_as_if_nothing_had_happened(
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     options = (*command, *FEW, "--train-steps", 20_000)
     assert Job(*options, out=whole).end()[0] == 0
-    moments = "presysid/checkpoints/*.npz", "ray", "train/checkpoint.npz", "walk/gait.png"
-    for moment in moments:
+
+    def killed_at(moment: str) -> None:
         job = Job(*options, out=parts)
         job.come_to(moment)
         job.process.kill()
         assert job.end()[0] == -signal.SIGKILL
         job.assert_nothing_left()
-    last = Run(*options, out=parts)
-    last.come_to_walk(2)
-    last.process.kill()
-    last.end()
-    last.assert_nothing_left()
+
+    for moment in ("presysid/checkpoints/*.npz", "ray", "train/checkpoint.npz"):
+        killed_at(moment)
+    walking = Run(*options, out=parts)
+    walking.come_to_walk(2)
+    walking.process.kill()
+    walking.end()
+    walking.assert_nothing_left()
+    killed_at("walk/gait.png")  # drawn beside the trials, whichever is sooner
     code, printed, err = Job(*options, out=parts).end()
     assert code == 0, err
     bounds = [json.loads((out / "presysid/bounds.json").read_text()) for out in (whole, parts)]
