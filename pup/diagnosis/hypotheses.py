@@ -110,6 +110,11 @@ class Hypothesis:
         """Values of the other shapes, which no refit moves."""
         return tuple(value for name, value in self.shape if name not in self.continuous)
 
+    @property
+    def variant(self) -> tuple[tuple[str, Place], tuple[float, ...]]:
+        """What it claims, in a shape that no refit leads away from."""
+        return self.key, self.choices
+
     @cached_property
     def least(self) -> dict[str, float]:
         """Magnitudes below which it is another thing, whatever it explains, in their units."""

@@ -167,11 +167,7 @@ class Selector:
         shown = bool(ranking) and ranking[0].surprise >= self.enough
         if not shown and (model.hypotheses or not glaring(fit.chi2, model.samples)):
             return None
-        contact = suspected(fit, self.replays.measured)
-        tried = self._begun(model, shortlist(ranking, self.enough, contact)) if shown else []
-        self._refit(tried, fit.chi2)
-        if shown and not model.hypotheses:
-            tried += self._further(model, ranking, tried)
+        tried = self._promising(model, ranking) if shown else []
         if not model.hypotheses and puzzling(fit, tried, DRIVEN):
             more, elsewhere = self._elsewhere(fit)
             ranked = {score.trace.hypothesis for score in ranking}
@@ -187,6 +183,13 @@ class Selector:
         if holds:
             holds[0] = self.ended(holds[0])
         return Round(model, told, (*holds, *others), len(holds))
+
+    def _promising(self, model: Model, ranking: Sequence[Score]) -> list[Tried]:
+        """Fits of the effects that a ranking speaks for; further down it for the first effect."""
+        contact = suspected(model.fit, self.replays.measured)
+        tried = self._begun(model, shortlist(ranking, self.enough, contact))
+        self._refit(tried, model.fit.chi2)
+        return tried if model.hypotheses else tried + self._further(model, ranking, tried)
 
     def _further(
         self, model: Model, ranking: Sequence[Score], tried: Sequence[Tried]

@@ -73,7 +73,7 @@ def shortlist(
         known = {key for key, _ in best}
         room = hypothesis.key in known or len(known) < most
         if score.surprise >= least and room:
-            best.setdefault((hypothesis.key, hypothesis.choices), score)
+            best.setdefault(hypothesis.variant, score)
     shared = {effect for (effect, place), _ in best if place.kind == "group"}
     first = ranking[0].trace.hypothesis
     for score in ranking:
@@ -81,16 +81,14 @@ def shortlist(
         spread = other.place.kind in EVERYWHERE and other.effect in shared
         alike = other.sibling_of(first) or spread
         if alike or (contact and in_contact(other)):
-            best.setdefault((other.key, other.choices), score)
+            best.setdefault(other.variant, score)
     return list(best.values())
 
 
 def untried(ranking: Sequence[Score], chosen: Sequence[Score]) -> list[Score]:
     """The best score of each effect, place and form that is not among those chosen."""
-    known = {(s.trace.hypothesis.key, s.trace.hypothesis.choices) for s in chosen}
+    known = {score.trace.hypothesis.variant for score in chosen}
     best: dict[object, Score] = {}
     for score in ranking:
-        one = (score.trace.hypothesis.key, score.trace.hypothesis.choices)
-        if one not in known:
-            best.setdefault(one, score)
-    return list(best.values())
+        best.setdefault(score.trace.hypothesis.variant, score)
+    return [score for variant, score in best.items() if variant not in known]

@@ -116,7 +116,7 @@ def distinct(tried: Sequence[Tried]) -> list[Tried]:
     """The best fit of each newest effect at each place, of each of its choices."""
     best: dict[object, Tried] = {}
     for one in sorted(tried, key=lambda one: one[1].chi2):
-        best.setdefault((one[0][-1].key, one[0][-1].choices), one)
+        best.setdefault(one[0][-1].variant, one)
     return list(best.values())
 
 
