@@ -112,6 +112,16 @@ class Commands(HeldCommands):
         now, before, share = self._looked_up(0, step, lateness)
         return Target(now, None, _ONE) if (share == 1).all() else Target(now, before, share)
 
+    def tables(self) -> tuple[tuple[Array, ...], tuple[NDArray[np.int64], ...]]:
+        """What the compiled loop needs of them; see `pup.physics.loop`.
+
+        Returns:
+          The commands of all recordings one after the other, since when each holds, and the shares
+          of sub-steps; then where in these the targets at a sub-step's end and beginning stand, and
+          which was the newest.
+        """
+        return (self._flat, self.time, self._share), (self._at, self._from, self._last)
+
     def _looked_up(
         self, first: int, step: int | Array, lateness: Array
     ) -> tuple[Array, Array, Array]:

@@ -5,6 +5,7 @@ own for each simulation and joint: the last sub-steps are kept for them.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,31 @@ class Event:
     rows: NDArray[np.int64]
     ticks: NDArray[np.int64]
     fraction: Array
+
+
+@dataclass(frozen=True)
+class Readings:
+    """All ticks of some recordings, in the order of the sub-steps after which they fall.
+
+    Attributes:
+      step: the last sub-step before each, shape (n_ticks,).
+      rows: of which recording.
+      ticks: where they are stored in packed arrays.
+      fraction: how far after the sub-step, of one.
+    """
+
+    step: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    ticks: NDArray[np.int64]
+    fraction: Array
+
+    def events(self, steps: int) -> tuple[Event | None, ...]:
+        """The same by sub-steps, of which there are so many."""
+        edges = np.searchsorted(self.step, np.arange(steps + 1))
+        return tuple(
+            Event(self.rows[a:b], self.ticks[a:b], self.fraction[a:b]) if b > a else None
+            for a, b in pairwise(edges)
+        )
 
 
 class History:

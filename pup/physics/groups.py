@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.commands import Commands
-from pup.physics.encoders import Event
+from pup.physics.encoders import Event, Readings
 from pup.physics.model import Model, compile_model, first_tilt, named_units, standing_qpos
 from pup.physics.rest import ticks_at_rest
 from pup.physics.simulator import Schedule, schedule
@@ -32,7 +31,8 @@ class Group:
       commands: their targets.
       power: share of torque on, shape (n_steps, n_recordings).
       running: how many recordings still run in each sub-step.
-      events: the ticks in each sub-step.
+      readings: their ticks.
+      events: the same in each sub-step.
       rests: which recordings begin at rest on the ground, shape (n_recordings,).
     """
 
@@ -45,6 +45,7 @@ class Group:
     commands: Commands
     power: Array
     running: NDArray[np.int64]
+    readings: Readings
     events: tuple[Event | None, ...]
     rests: NDArray[np.bool_]
 
@@ -73,6 +74,7 @@ def group_of(
         standing_qpos(robot, model, plans[i].start, tilt)
         for i, tilt in zip(members, torso, strict=True)
     ]
+    readings = _readings(ordered, [ticks[i].start for i in members])
     return Group(
         members=tuple(members),
         model=model,
@@ -83,7 +85,8 @@ def group_of(
         commands=Commands(ordered, robot.timestep),
         power=np.ascontiguousarray(power),
         running=np.sum([np.arange(steps) < p.steps for p in ordered], axis=0),
-        events=_events(ordered, [ticks[i].start for i in members], steps),
+        readings=readings,
+        events=readings.events(steps),
         rests=np.array([ticks_at_rest(recordings[i], units) > 1 for i in members]),
     )
 
@@ -93,9 +96,7 @@ def _extended(values: Array, steps: int) -> Array:
     return np.concatenate([values, np.repeat(values[-1:], steps - len(values), axis=0)])
 
 
-def _events(
-    plans: Sequence[Schedule], first_tick: Sequence[int], steps: int
-) -> tuple[Event | None, ...]:
+def _readings(plans: Sequence[Schedule], first_tick: Sequence[int]) -> Readings:
     rows = np.concatenate([np.full(len(p.tick_step), i) for i, p in enumerate(plans)])
     ticks = np.concatenate(
         [f + np.arange(len(p.tick_step)) for f, p in zip(first_tick, plans, strict=True)]
@@ -103,8 +104,4 @@ def _events(
     step = np.concatenate([p.tick_step for p in plans])
     fraction = np.concatenate([p.tick_fraction for p in plans])
     order = np.argsort(step, kind="stable")
-    edges = np.searchsorted(step[order], np.arange(steps + 1))
-    return tuple(
-        Event(rows[order[a:b]], ticks[order[a:b]], fraction[order[a:b]]) if b > a else None
-        for a, b in pairwise(edges)
-    )
+    return Readings(step[order], rows[order], ticks[order], fraction[order])

@@ -10,9 +10,12 @@ own row only.
 """
 
 import functools
+import hashlib
 import math
-from collections.abc import Callable
-from typing import Any, ParamSpec, get_type_hints
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 import numba
 import numpy as np
@@ -23,14 +26,11 @@ Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
 Ids = NDArray[np.int32]
 P = ParamSpec("P")
+R = TypeVar("R")
 
-_TYPES = {
-    Array: numba.float64[:, :],
-    Mask: numba.boolean[:, :],
-    Index: numba.int64[:, :],
-    Ids: numba.int32[:],
-    float: numba.float64,
-}
+ARRAY, MASK, INDEX = numba.float64[:, :], numba.boolean[:, :], numba.int64[:, :]
+IDS = numba.int32[:]
+_TYPES = {Array: ARRAY, Mask: MASK, Index: INDEX, Ids: IDS, float: numba.float64}
 """Strides of any kind, so that a function is compiled once whatever arrays are views of."""
 
 
@@ -50,6 +50,32 @@ def kernel(function: Callable[P, None]) -> Callable[P, None]:
     make = functools.partial(numba.njit, nogil=True, error_model="numpy")
     compiled: Callable[P, None] = _compile(make, function, signature)
     return compiled
+
+
+def part(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function that only compiled ones call, for the types that they call it with."""
+    compiled: Callable[P, R] = numba.njit(nogil=True, error_model="numpy")(function)
+    return compiled
+
+
+def assembled(
+    signature: object, modules: Sequence[ModuleType]
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Compile a function that calls compiled ones of other modules.
+
+    What Numba has kept it holds against the function's own file alone. So the name by which it is
+    kept tells of the others.
+    """
+    sources = b"".join(Path(str(module.__file__)).read_bytes() for module in modules)
+    made_of = hashlib.sha256(sources).hexdigest()[:16]
+
+    def compile_now(function: Callable[P, R]) -> Callable[P, R]:
+        function.__qualname__ = f"{function.__name__}_{made_of}"
+        make = functools.partial(numba.njit, nogil=True, error_model="numpy")
+        compiled: Callable[P, R] = _compile(make, function, signature)
+        return compiled
+
+    return compile_now
 
 
 def _implicit_share(damping: float, inertia: float, timestep: float) -> float:

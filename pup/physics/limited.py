@@ -98,6 +98,18 @@ class LimitedLaw:
         before, acted, damped = self._last
         before[:n], acted[:n], damped[:n] = velocity, torque, damping
 
+    def parts(self) -> tuple[Array, ...]:
+        """What the compiled loop needs of a steady law; see `pup.physics.loop`.
+
+        Returns:
+          Largest and smallest torque; what the last sub-step left; what `limit` takes beside; the
+          damping outside the servos; and what `split` takes beside.
+        """
+        assert self.law.steady
+        limit = (*self._last, self._share, self._inertia)
+        split = (*self._free, *self._held, self.inertia, self.timestep)
+        return (self._most, self._least, *limit, self.viscous, *split)
+
     def begin(self) -> None:
         """Let all simulations start: nothing is known of what has acted before."""
         self._last[1][:] = np.nan

@@ -14,6 +14,7 @@ from pup.physics.actuators import LAWS, TorqueLaw
 from pup.physics.encoders import Event, History
 from pup.physics.fields import scaled
 from pup.physics.groups import Group, group_of
+from pup.physics.loop import Loop
 from pup.physics.model import mount, standing_qpos
 from pup.physics.one_joint import OneJoint
 from pup.physics.outfit import as_the_imu_tells, fit_out, longest
@@ -272,6 +273,33 @@ class Run:
 
     def into(self, out: Trajectories, part: slice) -> None:
         """Run to the end and write the candidates' part of the trajectories."""
+        alone = self.push is None
+        loop = Loop.of(self.servos, self.engine, self.terms, self.group.running) if alone else None
+        if loop is None:
+            self._step_by_step(out, part)
+        else:
+            self._at_once(loop, out, part)
+
+    def _at_once(self, loop: Loop, out: Trajectories, part: slice) -> None:
+        """The same by a compiled loop, which leaves to MuJoCo what is beyond a joint's range."""
+        n, steps = len(self.ids), len(self.group.running)
+        sensed = self._sensed(n)
+        loop.told[0] = sensed[0][:, 0]
+        self._substep(0, n, sensed)
+        lost = np.where(self._lost(), 0, steps)
+        step = loop.move(1)
+        while step < steps:
+            active = self.ids[: int(self.group.running[step]) * self.candidates]
+            self._advance(active[loop.engine.left[: len(active), 0]])
+            lost = np.where(self._lost(), np.minimum(lost, step), lost)
+            step = loop.move(step + 1)
+        ticks = self.group.readings
+        lanes = ticks.rows[:, None] * self.candidates + self.ids[: self.candidates]
+        values = loop.read(ticks, lanes, self.joints.age)
+        values[lost[lanes] <= ticks.step[:, None]] = np.nan
+        out.position[part, ticks.ticks, 0] = values.T
+
+    def _step_by_step(self, out: Trajectories, part: slice) -> None:
         observed: Event | None = None
         n = len(self.ids)
         for step, (running, event) in enumerate(
@@ -339,9 +367,12 @@ class Run:
 
     def _sound(self, rows: NDArray[np.int64], values: Array) -> Array:
         """The values, NaN for simulations that have broken down."""
-        lost = self.broken[rows] | (self.warned[rows] > 0).any(axis=1)
-        values[lost] = np.nan
+        values[self._lost()[rows]] = np.nan
         return values
+
+    def _lost(self) -> NDArray[np.bool_]:
+        """Which simulations have broken down."""
+        return np.asarray(self.broken | (self.warned > 0).any(axis=1))
 
 
 def _write(to: Array, part: slice, event: Event, values: Array) -> None:

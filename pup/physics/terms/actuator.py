@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.implicit import implicit_share
 from pup.physics.terms import kernels
-from pup.physics.terms.base import Drive, Flow, Outcome, Quantity, Term, begin
+from pup.physics.terms.base import Drive, Flow, Outcome, Parts, Quantity, Term
 
 Array = NDArray[np.float64]
 
@@ -17,9 +16,13 @@ class QuadraticDamping(Term):
     quantities = (Quantity("coefficient", "N m s2/rad2", 0.04, 0.5),)
     source = "estimate: 0.03 to 0.1"
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["coefficient"],)
+
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        flow.damping += self.values["coefficient"][: len(flow.torque)] * np.abs(flow.velocity)
+        kernels.drag(flow.damping, flow.velocity, *self.parts())
 
 
 class TorqueSpeedLimit(Term):
@@ -32,12 +35,13 @@ class TorqueSpeedLimit(Term):
     quantities = (Quantity("slope", "N m s/rad", 0.2, 1.5),)
     source = "MX-28 e-manual: 2.5 N m at rest, 55 rpm free: 0.43 N m s/rad"
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["slope"],)
+
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        slope = self.values["slope"][: len(drive.torque)]
-        drive.upper -= slope * drive.velocity
-        drive.lower -= slope * drive.velocity
-        drive.slope += slope
+        kernels.outrun(drive.upper, drive.lower, drive.slope, drive.velocity, *self.parts())
 
 
 class ActuatorLag(Term):
@@ -68,31 +72,26 @@ class ActuatorLag(Term):
         self._lagging = np.full_like(steps, np.nan)
         self._lagging_more = np.where(two, np.nan, 0.0)
         self._asked, self._ahead, self._asked_more, self._ahead_more = np.zeros((4, *steps.shape))
+        self._step = np.ones((len(steps), 1)) * self.scene.timestep
+
+    def parts(self) -> Parts:
+        """See Term: of both stages alike, then of the first, and of the second."""
+        both = self.scene.inertia, self._step, self._kept, self._share
+        first = self._time, self._lagging, self._asked, self._ahead
+        second = self._more, self._lagging_more, self._asked_more, self._ahead_more
+        return (*both, *first, *second)
 
     def flow(self, flow: Flow) -> None:
         """See Term: what is applied is the mean over the sub-step.
 
         A part of it is what is asked for now, the rest what was, less the damping that is now.
         """
-        law = flow.law_damping
+        law, told = flow.law_damping, self.parts()
         assert law is not None
-        share = implicit_share(law, self.scene.inertia[: len(law)], self.scene.timestep)
-        asked, ahead = (self._asked, self._asked_more), (self._ahead, self._ahead_more)
-        stages = zip(
-            (self._time, self._more), (self._lagging, self._lagging_more), asked, ahead, strict=True
-        )
-        for time, *kept in list(stages)[: 1 + bool(self._more.any())]:
-            kernels.lag(
-                flow.torque,
-                flow.damping,
-                flow.velocity,
-                law,
-                share,
-                time,
-                self._kept,
-                self._share,
-                *kept,
-            )
+        both = flow.torque, flow.damping, flow.velocity, law, *told[:4]
+        kernels.lag(*both, *told[4:8])
+        if self._more.any():
+            kernels.lag(*both, *told[8:])
 
 
 class VoltageSag(Term):
@@ -115,19 +114,18 @@ class VoltageSag(Term):
         self._left = np.ones_like(self.values["drop"])
         self._kept = np.exp(-self.scene.timestep / np.maximum(self.values["buffer"], 1e-9))
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return self._left, self.values["drop"], self._kept
+
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        left = self._left[: len(drive.torque)]
-        drive.torque *= left
-        drive.upper *= left
-        drive.lower *= left
+        kernels.dim(drive.torque, drive.upper, drive.lower, self._left)
 
     def settle(self, outcome: Outcome) -> None:
         """See Term."""
-        n = len(outcome.torque)
-        load = self.values["drop"][:n] * np.abs(outcome.torque).sum(axis=1, keepdims=True)
-        goal = 1 / (1 + load)  # the supply's own resistance also limits what it gives
-        self._left[:n] = goal + self._kept[:n] * (self._left[:n] - goal)
+        left, *fixed = self.parts()
+        kernels.sag(left, outcome.torque, *fixed)
 
 
 class ThermalDrift(Term):
@@ -153,23 +151,22 @@ class ThermalDrift(Term):
         self._heat = self.values["load"] / self.scene.limit
         step = self.scene.timestep
         self._cooling = step / np.maximum(self.values["time"], step)
+        self._step = np.ones((len(self._warmth), 1)) * step
+
+    def parts(self) -> Parts:
+        """See Term."""
+        rate, load = self.values["rate"], self.values["load"]
+        return self._warmth, rate, load, self._heat, self._cooling, self._step
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        n = len(drive.torque)
-        left = np.maximum(1 - self.values["rate"][:n] * self._warmth[:n], 0.05)
-        drive.torque *= left
-        drive.upper *= left
-        drive.lower *= left
-        drive.damping *= 1 - self.values["load"][:n] * (1 - left)
+        kernels.weaken(drive.torque, drive.damping, drive.upper, drive.lower, *self.parts()[:3])
 
     def settle(self, outcome: Outcome) -> None:
         """See Term: nothing warms before the recording begins."""
-        n = len(outcome.torque)
-        gained = 1 - self.values["load"][:n] + self._heat[:n] * np.abs(outcome.torque)
-        gained *= outcome.time >= 0
-        warmth = self._warmth[:n]
-        warmth += self.scene.timestep * gained - self._cooling[:n] * warmth
+        if np.min(outcome.time) >= 0:  # where simulations have times of their own, none is before
+            warmth, _, *fixed = self.parts()
+            kernels.warm(warmth, outcome.torque, *fixed)
 
 
 class GainAsymmetry(Term):
@@ -180,10 +177,13 @@ class GainAsymmetry(Term):
     quantities = (Quantity("share", "1", 0.06, 0.5, signed=True),)
     source = "SO-101 servos: 6 to 8 % by our own fits of real recordings"
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["share"],)
+
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        share = self.values["share"][: len(drive.torque)]
-        drive.torque *= np.where(drive.error > 0, 1 + share, 1 - share)
+        kernels.favour(drive.torque, drive.error, *self.parts())
 
 
 SAG = 1.5
@@ -214,6 +214,12 @@ class IntegralAction(Term):
         self._sum = np.zeros_like(self.values["gain"])
         self._most = self.values["share"] * self.scene.limit / np.maximum(self.values["gain"], 1e-9)
         self._least = -self._most
+        self._step = np.ones((len(self._sum), 1)) * self.scene.timestep
+
+    def parts(self) -> Parts:
+        """See Term."""
+        gain, lasting = self.values["gain"], self.values["lasting"]
+        return gain, self._sum, lasting, self._least, self._most, self._step
 
     def held(self, load: Array, gravity: Array) -> Array:
         """See Term: a controller that has held a load for long starts with it in its integral.
@@ -227,20 +233,13 @@ class IntegralAction(Term):
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        n = len(drive.torque)
-        drive.torque += self.values["gain"][:n] * self._after(self.scene.timestep / 2, drive.error)
+        gain, total, _, *fixed = self.parts()
+        kernels.integrate(drive.torque, drive.error, gain, total, *fixed)
 
     def settle(self, outcome: Outcome) -> None:
         """See Term: a servo whose torque is off may forget its integral."""
-        after = self._after(self.scene.timestep, outcome.error)
-        n = len(after)
-        self._sum[:n] = after * np.maximum(outcome.on, self.values["lasting"][:n])
-
-    def _after(self, time: float | Array, error: Array) -> Array:
-        """What an error makes of the integral in some time, rad s."""
-        n = len(error)
-        after = self._sum[:n] + time * error
-        return np.maximum(np.minimum(after, self._most[:n]), self._least[:n])
+        _, total, *fixed = self.parts()
+        kernels.add_up(total, outcome.error, np.atleast_2d(outcome.on), *fixed)
 
 
 class DerivativeKick(Term):
@@ -263,22 +262,21 @@ class DerivativeKick(Term):
         self._goal = np.full_like(self.values["gain"], np.nan)
         self._rate = np.zeros_like(self._goal)
         self._pace = -self.scene.timestep / np.maximum(self.values["time"], 1e-9)
+        self._step = np.ones((len(self._goal), 1)) * self.scene.timestep
+
+    def parts(self) -> Parts:
+        """See Term."""
+        return self.values["gain"], self._step, self._goal, self._rate, self._pace
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term: commands stay as they are, their filtered rate is taken note of."""
-        n = len(now)
-        goal, pace = self._goal[:n], self._pace[:n]
-        begin(goal, before)
-        at_change = before + np.exp(pace * (1 - share)) * (goal - before)
-        later = now + np.exp(pace * share) * (at_change - now)
-        self._rate[:n] = (later - goal) / self.scene.timestep
-        goal[:] = later
+        _, *own = self.parts()
+        kernels.differ(now, before, np.atleast_2d(share), *own)
         return now, before
 
     def drive(self, drive: Drive) -> None:
         """See Term."""
-        n = len(drive.torque)
-        drive.torque += self.values["gain"][:n] * self._rate[:n]
+        kernels.kick(drive.torque, self.values["gain"], self._rate)
 
 
 class DeadBand(Term):
@@ -288,10 +286,15 @@ class DeadBand(Term):
     quantities = (Quantity("width", "rad", 0.004, 0.05),)
     source = "one encoder step (MX-28: 1.5 mrad) to 0.29 degrees (RX-28 manual, margin)"
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["width"],)
+
     def error(self, error: Array) -> Array:
         """See Term."""
-        width = self.values["width"][: len(error)]
-        return np.copysign(np.maximum(np.abs(error) - width, 0.0), error)
+        left = error.copy()
+        kernels.forgive(left, *self.parts())
+        return left
 
 
 class TargetRateLimit(Term):
@@ -314,24 +317,20 @@ class TargetRateLimit(Term):
         slowness, sluggishness = (self.values[name] for name in ("slowness", "sluggishness"))
         self._rate = 1 / np.maximum(slowness, 1e-9)
         self._acceleration = 1 / np.maximum(sluggishness, 1e-9)
-        self._limited = (slowness > 0) | (sluggishness > 0)
+        self._limited = np.where((slowness > 0) | (sluggishness > 0), 1.0, 0.0)
         self._goal = np.full_like(slowness, np.nan)
         self._speed = np.zeros_like(slowness)
+        self._step = np.ones((len(slowness), 1)) * self.scene.timestep
+
+    def parts(self) -> Parts:
+        """See Term."""
+        fixed = self._step, self._rate, self._acceleration, self._limited
+        return (*fixed, self._goal, self._speed)
 
     def command(self, now: Array, before: Array, share: Array) -> tuple[Array, Array]:
         """See Term."""
         now, before = now.copy(), before.copy()
-        kernels.travel(
-            now,
-            before,
-            np.atleast_2d(share),
-            np.atleast_2d(self.scene.timestep),
-            self._rate,
-            self._acceleration,
-            self._limited,
-            self._goal,
-            self._speed,
-        )
+        kernels.travel(now, before, np.atleast_2d(share), *self.parts())
         return now, before
 
 
@@ -347,9 +346,10 @@ class Cogging(Term):
     )
     source = "estimate: 0.02 to 0.06 N m"
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return self.values["sine"], self.values["cosine"], self.values["teeth"]
+
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n = len(flow.torque)
-        turn = self.values["teeth"][:n] * flow.angle
-        flow.torque += self.values["sine"][:n] * np.sin(turn)
-        flow.torque += self.values["cosine"][:n] * np.cos(turn)
+        kernels.ripple(flow.torque, flow.angle, *self.parts())

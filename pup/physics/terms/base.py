@@ -20,6 +20,7 @@ from pup.robot_parts import PlaceKind
 
 Array = NDArray[np.float64]
 Kind = PlaceKind
+Parts = tuple[Array, ...]
 
 
 @dataclass(frozen=True)
@@ -254,6 +255,14 @@ class Term:
 
         Returns:
           What this term does not hold of the load.
+        """
+        raise NotImplementedError
+
+    def parts(self) -> Parts:
+        """The arrays that a term's kernels take beside a sub-step's own, rows of simulations.
+
+        They stay the same arrays from `prepare` on. A term whose hooks in a sub-step are kernels
+        has them, and can be in the loop of `pup.physics.loop`, which names them in this order.
         """
         raise NotImplementedError
 

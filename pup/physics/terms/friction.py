@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.terms import kernels
-from pup.physics.terms.base import Flow, Quantity, Term
+from pup.physics.terms.base import Flow, Parts, Quantity, Term
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,14 @@ class Friction(Term):
         self._load: Array | None = None
         self._length = self.length()
         self._step = np.ones((len(self._bend), 1)) * self.scene.timestep
+        self._level = np.empty_like(self._bend)
+
+    def parts(self) -> Parts:
+        """See Term: of the bristle, then of its level."""
+        return (*self._bristle(), *self.grip())
+
+    def _bristle(self) -> Parts:
+        return self._bend, self._length, self.scene.inertia, self._step
 
     def held(self, load: Array, gravity: Array) -> Array:
         """See Term: a joint that is found at rest has its bristle bent by what it holds."""
@@ -46,20 +54,15 @@ class Friction(Term):
         if self._load is not None:
             self._bend[:] = np.clip(-self._load / np.maximum(level, 1e-9), -1.0, 1.0)
             self._load = None
-        kernels.rub(
-            flow.torque,
-            flow.damping,
-            self._bend,
-            flow.velocity,
-            flow.coming,
-            level,
-            self._length,
-            self.scene.inertia,
-            self._step,
-        )
+        bend, *fixed = self._bristle()
+        kernels.rub(flow.torque, flow.damping, bend, flow.velocity, flow.coming, level, *fixed)
 
     def level(self, flow: Flow) -> Array:
-        """Friction torque of a joint that slips, N m."""
+        """Friction torque of a joint that slips, N m, the rows of all simulations."""
+        raise NotImplementedError
+
+    def grip(self) -> Parts:
+        """What that depends on."""
         raise NotImplementedError
 
     def length(self) -> Array:
@@ -74,9 +77,13 @@ class CoulombFriction(Friction):
     quantities = (Quantity("torque", "N m", 0.08, 1.0),)
     source = "BAM M1 of the MX-64 (arXiv:2410.08650): 0.09 N m"
 
+    def grip(self) -> Parts:
+        """See Friction."""
+        return (self.values["torque"],)
+
     def level(self, flow: Flow) -> Array:
         """See Friction."""
-        return self.values["torque"][: len(flow.torque)]
+        return self.values["torque"]
 
 
 class StribeckFriction(Friction):
@@ -90,11 +97,15 @@ class StribeckFriction(Friction):
     )
     source = "BAM M4 to M6 (arXiv:2410.08650): 0.02 to 0.12 N m more at rest, 1.5 to 2.6 rad/s"
 
+    def grip(self) -> Parts:
+        """See Friction."""
+        return self._level, self.values["torque"], self.values["rest"], self.values["speed"]
+
     def level(self, flow: Flow) -> Array:
         """See Friction."""
-        n = len(flow.torque)
-        fade = np.exp(-np.abs(flow.velocity) / np.maximum(self.values["speed"][:n], 1e-9))
-        return self.values["torque"][:n] + self.values["rest"][:n] * fade
+        level, *fixed = self.grip()
+        kernels.stribeck(level, flow.velocity, *fixed)
+        return self._level
 
 
 class RisingStaticFriction(Friction):
@@ -123,20 +134,16 @@ class RisingStaticFriction(Friction):
         super().prepare()
         self._age = np.full_like(self._bend, RESTED)
 
-    def flow(self, flow: Flow) -> None:
-        """See Friction: the age by d(age)/dt = 1 - fresh age, which at rest just grows."""
-        n = len(flow.torque)
-        fresh = np.abs(flow.velocity) / np.maximum(self.values["slip"][:n], 1e-9)
-        lost = -np.expm1(-fresh * self.scene.timestep)
-        grown = np.where(fresh > 1e-9, lost / np.maximum(fresh, 1e-9), self.scene.timestep)
-        self._age[:n] = self._age[:n] * (1 - lost) + grown
-        super().flow(flow)
+    def grip(self) -> Parts:
+        """See Friction."""
+        sizes = (self.values[name] for name in ("torque", "rise", "time", "slip"))
+        return self._level, self._age, *sizes, self._step
 
     def level(self, flow: Flow) -> Array:
-        """See Friction."""
-        n = len(flow.torque)
-        share = self._age[:n] / (self._age[:n] + np.maximum(self.values["time"][:n], 1e-9))
-        return np.asarray(self.values["torque"][:n] + self.values["rise"][:n] * share)
+        """See Friction: the age by d(age)/dt = 1 - fresh age, which at rest just grows."""
+        level, age, *sizes = self.grip()
+        kernels.rising(level, age, flow.velocity, *sizes)
+        return self._level
 
 
 class PreslidingHysteresis(Friction):
@@ -153,9 +160,13 @@ class PreslidingHysteresis(Friction):
         """See Term: what bends a bristle that gives is not known; it starts relaxed."""
         return load
 
+    def grip(self) -> Parts:
+        """See Friction."""
+        return (self.values["torque"],)
+
     def level(self, flow: Flow) -> Array:
         """See Friction."""
-        return self.values["torque"][: len(flow.torque)]
+        return self.values["torque"]
 
     def length(self) -> Array:
         """See Friction."""
@@ -169,12 +180,16 @@ class LoadDependentFriction(Friction):
     quantities = (Quantity("share", "1", 0.15, 0.8),)
     source = "BAM M4 to M6 (arXiv:2410.08650): 0.22 to 0.31 on MX-64 and MX-106"
 
+    def grip(self) -> Parts:
+        """See Friction."""
+        return self._level, self.values["share"], self.scene.armature, self._step
+
     def level(self, flow: Flow) -> Array:
         """See Friction: what the gear passes on is the motor's torque less what turns its rotor."""
-        n, motor = len(flow.torque), flow.carried()
-        acceleration = (flow.coming - flow.velocity) / self.scene.timestep
-        passed = motor - self.scene.armature[:n] * acceleration
-        return np.asarray(self.values["share"][:n] * np.abs(motor + passed))
+        level, *fixed = self.grip()
+        now = flow.velocity, flow.coming
+        kernels.passed(level, flow.torque, flow.damping, *now, *fixed)
+        return self._level
 
 
 class GearEfficiency(Friction):
@@ -184,10 +199,15 @@ class GearEfficiency(Friction):
     quantities = (Quantity("loss", "1", 0.2, 0.8),)
     source = "estimate: 0.7 to 0.9 for servo gears; BAM M5 and M6"
 
+    def grip(self) -> Parts:
+        """See Friction."""
+        return self._level, self.values["loss"]
+
     def level(self, flow: Flow) -> Array:
         """See Friction."""
-        carried = np.abs(flow.carried())
-        return self.values["loss"][: len(carried)] * carried
+        level, loss = self.grip()
+        kernels.carried(level, flow.torque, flow.damping, flow.coming, loss)
+        return self._level
 
 
 class FrictionAsymmetry(Friction):
@@ -203,13 +223,12 @@ class FrictionAsymmetry(Friction):
     one_way = True
     source = "EMPS (Janot, Gautier, Brunot 2019): viscous friction 166.7 forward, 240.4 backward"
 
-    def flow(self, flow: Flow) -> None:
+    def grip(self) -> Parts:
         """See Friction."""
-        viscous = self.values["viscous"][: len(flow.torque)]
-        flow.damping += np.where(viscous * flow.velocity > 0, np.abs(viscous), 0.0)
-        super().flow(flow)
+        return self._level, self.values["torque"], self.values["viscous"]
 
     def level(self, flow: Flow) -> Array:
         """See Friction."""
-        torque = self.values["torque"][: len(flow.torque)]
-        return np.where(torque * self._bend[: len(torque)] >= 0, np.abs(torque), 0.0)
+        level, *sizes = self.grip()
+        kernels.one_way(level, flow.damping, flow.velocity, self._bend, *sizes)
+        return self._level

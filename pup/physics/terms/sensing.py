@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pup.physics.rotations import CONJUGATE, multiply, rotation
-from pup.physics.terms.base import Quantity, Term
+from pup.physics.terms import kernels
+from pup.physics.terms.base import Parts, Quantity, Term
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,13 @@ class EncoderBias(Term):
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
-        return position + self.values["offset"][: len(position)], velocity
+        told = position.copy()
+        kernels.shift(told, *self.parts())
+        return told, velocity
+
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["offset"],)
 
 
 class EncoderEccentricity(Term):
@@ -38,19 +45,27 @@ class EncoderEccentricity(Term):
     )
     source = "estimate: 5 to 12 mrad"
 
+    def prepare(self) -> None:
+        """See Term."""
+        self._periods = np.ones_like(self.values["sine"])
+
+    def parts(self) -> Parts:
+        """See Term."""
+        return self.values["sine"], self.values["cosine"], self._periods
+
     def start(self, position: Array, torso: Array) -> None:
         """See Term."""
-        nearly = position - self._off(position)
-        position -= self._off(nearly)
+        nearly = 2 * position - self._told(position)
+        position += nearly - self._told(nearly)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
-        return position + self._off(position), velocity
+        return self._told(position), velocity
 
-    def _off(self, position: Array) -> Array:
-        n = len(position)
-        sine, cosine = self.values["sine"][:n], self.values["cosine"][:n]
-        return sine * np.sin(position) + cosine * np.cos(position)
+    def _told(self, position: Array) -> Array:
+        told = position.copy()
+        kernels.ripple(told, position, *self.parts())
+        return told
 
 
 class MeasurementDelay(Term):

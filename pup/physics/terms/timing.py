@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pup.physics.terms.base import Quantity, Term
+from pup.physics.terms.base import Parts, Quantity, Term
 
 Array = NDArray[np.float64]
 
@@ -16,6 +16,10 @@ class CommandDelay(Term):
     kinds = ("joint", "group", "bus")
     quantities = (Quantity("time", "s", 0.012, 0.08),)
     source = "9.5 ms (PACE, issue 19), 5 to 20 ms (unitree_sim_isaaclab, issue 108)"
+
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["time"],)
 
     def lateness(self, time: float | Array, n: int) -> Array:
         """See Term."""
@@ -31,6 +35,10 @@ class ClockSkew(Term):
     layout = "one"
     quantities = (Quantity("share", "1", 0.002, 0.02, signed=True),)
     source = "estimate: 0.1 to 0.5 %"
+
+    def parts(self) -> Parts:
+        """See Term."""
+        return (self.values["share"],)
 
     def lateness(self, time: float | Array, n: int) -> Array:
         """See Term."""

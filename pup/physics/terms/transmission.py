@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pup.physics.implicit import implicit_share
 from pup.physics.model import Model
 from pup.physics.terms import kernels
-from pup.physics.terms.base import Flow, Quantity, Scene, Term, begin
+from pup.physics.terms.base import Flow, Parts, Quantity, Scene, Term, begin
 from pup.physics.writer import FieldWriter
 
 Array = NDArray[np.float64]
@@ -99,6 +99,7 @@ class Drivetrain(Term):
         self._play_seen = play / np.maximum(self._gap, 1e-12)
         self._bend_seen = bend / np.maximum(self._give, 1e-12)
         self._active = (self._gap > 0) | (self._give > 0)
+        self._acts = self._active.astype(np.float64)
         self._first = np.full_like(self._gap, np.nan)
         self._ahead = np.zeros_like(self._gap)
         self.driven = np.zeros_like(self._gap)
@@ -134,26 +135,24 @@ class Drivetrain(Term):
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
         told, felt = np.empty(position.shape), np.empty(position.shape)
-        kernels.follow(
-            told,
-            felt,
-            position,
-            velocity,
-            self._position,
-            self._velocity,
-            self._free,
-            self._heft,
-            self._torque,
-            self._damping,
-            self._first,
-            self._ahead,
-            self._active,
-            self._gap,
-            self._play_seen,
-            self._bend_seen,
-            self._step,
-        )
+        kernels.follow(told, felt, position, velocity, *self._motors(), *self._seen())
         return told, felt
+
+    def parts(self) -> Parts:
+        """See Term: of the motors, of what encoders see, of what reaches links, and before."""
+        return (*self._motors(), *self._seen(), *self._between(), self._before)
+
+    def _motors(self) -> Parts:
+        moved = self._position, self._velocity, self._free, self._heft
+        return (*moved, self._torque, self._damping)
+
+    def _seen(self) -> Parts:
+        starts = self._first, self._ahead, self._acts, self._gap
+        return (*starts, self._play_seen, self._bend_seen, self._step)
+
+    def _between(self) -> Parts:
+        springs = self._give, self._rotor, self._reach, self._past
+        return (self._acts, self._gap, *springs, self._step)
 
     def turned(self, position: Array) -> Array:
         """Angles of what servos turn, their motors or else their links, (n_active, n_joints), rad.
@@ -200,27 +199,8 @@ class Drivetrain(Term):
         begin(before, flow.link)
         flow.angle, flow.velocity, flow.coming = flow.position, flow.link, 2 * flow.link - before
         before[:] = flow.link
-        kernels.engage(
-            flow.torque,
-            flow.damping,
-            flow.brake,
-            flow.viscous,
-            flow.position,
-            flow.velocity,
-            self._position,
-            self._velocity,
-            self._free,
-            self._heft,
-            self._torque,
-            self._damping,
-            self._active,
-            self._gap,
-            self._give,
-            self._rotor,
-            self._reach,
-            self._past,
-            self._step,
-        )
+        on_its_way = flow.torque, flow.damping, flow.brake, flow.viscous
+        kernels.engage(*on_its_way, flow.position, flow.velocity, *self._motors(), *self._between())
 
 
 class Backlash(Transmission):
@@ -272,10 +252,13 @@ class JointSpring(Term):
     )
     source = "estimate: 0.05 to 0.3 N m/rad"
 
+    def parts(self) -> Parts:
+        """See Term."""
+        return self.values["stiffness"], self.values["preload"]
+
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n = len(flow.torque)
-        flow.torque += self.values["preload"][:n] - self.values["stiffness"][:n] * flow.position
+        kernels.pull(flow.torque, flow.position, *self.parts())
 
 
 class JointStop(Term):
@@ -308,14 +291,11 @@ class JointStop(Term):
         # How far ahead of the velocities what presses on it is told.
         self._soon, self._later = np.ones_like(self._past) * step / 2, self._reach + self._past
 
+    def parts(self) -> Parts:
+        """See Term."""
+        stop = self._side, self.values["angle"], self.values["stiffness"]
+        return (*stop, self._soon, self._later, self._past, self._reach)
+
     def flow(self, flow: Flow) -> None:
         """See Term."""
-        n = len(flow.torque)
-        into = self._side[:n] * (flow.position - self.values["angle"][:n])
-        speed = self._side[:n] * flow.velocity
-        pressed = (into + self._soon[:n] * speed > 0) & (into + self._later[:n] * speed > 0)
-        if not pressed.any():
-            return
-        stiffness = np.where(pressed, self.values["stiffness"][:n], 0.0)
-        flow.torque -= self._side[:n] * stiffness * (into + self._past[:n] * speed)
-        flow.damping += stiffness * self._reach[:n]
+        kernels.block(flow.torque, flow.damping, flow.position, flow.velocity, *self.parts())

@@ -1,0 +1,57 @@
+"""The arithmetic of terms in a sub-step, compiled; see `pup.physics.kernels` for the arrays."""
+
+from pup.physics.terms.kernels.friction import (
+    carried,
+    drag,
+    one_way,
+    passed,
+    ripple,
+    rising,
+    rub,
+    stribeck,
+)
+from pup.physics.terms.kernels.link import block, engage, follow, pull, shift
+from pup.physics.terms.kernels.servo import (
+    add_up,
+    differ,
+    dim,
+    favour,
+    forgive,
+    integrate,
+    kick,
+    lag,
+    outrun,
+    sag,
+    travel,
+    warm,
+    weaken,
+)
+
+__all__ = [
+    "add_up",
+    "block",
+    "carried",
+    "differ",
+    "dim",
+    "drag",
+    "engage",
+    "favour",
+    "follow",
+    "forgive",
+    "integrate",
+    "kick",
+    "lag",
+    "one_way",
+    "outrun",
+    "passed",
+    "pull",
+    "ripple",
+    "rising",
+    "rub",
+    "sag",
+    "shift",
+    "stribeck",
+    "travel",
+    "warm",
+    "weaken",
+]
