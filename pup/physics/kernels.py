@@ -54,7 +54,9 @@ def kernel(function: Callable[P, None]) -> Callable[P, None]:
 
 def part(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that only compiled ones call, for the types that they call it with."""
-    compiled: Callable[P, R] = numba.njit(nogil=True, error_model="numpy")(function)
+    compiled: Callable[P, R] = numba.njit(nogil=True, error_model="numpy", inline="always")(
+        function
+    )
     return compiled
 
 

@@ -214,71 +214,71 @@ def _move(
     motor, has_motor = train[0], train[8]
     qpos, qvel, force, damped = state
     forces, inertia, ranges = fixed
-    steps = len(running)
-    n = running[first - 1, 0] * candidates
-    room = np.empty((21, n, 1))
-    for step in range(first, steps + 1):
-        link = (qpos[:n], qvel[:n])
-        sub_step.sense((room[0, :n], room[1, :n]), link, train, bias, eccentricity)
-        trace[step, :n] = room[0, :n, 0]
-        if step == steps:
-            break
+    room, step, n = np.empty((22, len(ids), 1)), first, running[first - 1, 0] * candidates
+    link, sensed = (qpos[:n], qvel[:n]), (room[0, :n], room[1, :n])
+    sub_step.sense(sensed, link, train, bias, eccentricity)
+    trace[step, :n] = sensed[0][:, 0]
+    while step < len(running):
         recordings = running[step, 0]
         n = recordings * candidates
-        link, sensed = (qpos[:n], qvel[:n]), (room[0, :n], room[1, :n])
-        target = (room[2, :n], room[3, :n], room[4, :n])
-        time = step * timestep - lead
-        if len(delay) + len(late[0]) + len(skew[0]) > 0:
-            delays = (delay, late[0], skew[0])
-            sub_step.late(target, step, recordings, timestep, time, commands, found[2], delays)
-        else:
-            sub_step.on_time(target, step, candidates, commands, found)
-        changes = np.any(target[2] != 1.0)
-        if sub_step.there(goals):
-            laws.travel(target[0], target[1], target[2], *goals)
-        if sub_step.there(kick):
-            laws.differ(target[0], target[1], target[2], *kick[1:])
-        error, torque, damping, own = room[5, :n], room[6, :n], room[7, :n], room[8, :n]
-        limits = (room[9, :n], room[10, :n], room[11, :n])
-        sub_step.answer((error, torque, damping, own), limits, target[0], sensed, law, driving)
-        if changes:
-            then = (room[12, :n], room[13, :n], room[14, :n], room[15, :n])
-            sub_step.answer(then, limits, target[1], sensed, law, driving)
-            kernels.blend(error, torque, damping, then[0], then[1], then[2], target[2])
+        link, active, still = (qpos[:n], qvel[:n]), ids[:n], left[:n]
+        told, felt, now, before = room[0, :n], room[1, :n], room[2, :n], room[3, :n]
+        share, error, torque, damping = room[4, :n], room[5, :n], room[6, :n], room[7, :n]
+        own, on, net, brake = room[8, :n], room[9, :n], room[10, :n], room[11, :n]
+        viscous, angle, coming = room[12, :n], room[13, :n], room[14, :n]
+        then = (room[15, :n], room[16, :n], room[17, :n], room[18, :n])
+        limits = (room[19, :n], room[20, :n], room[21, :n])
+        target, sensed = (now, before, share), (told, felt)
+        while step < len(running) and running[step, 0] == recordings:
+            time = step * timestep - lead
+            if len(delay) + len(late[0]) + len(skew[0]) > 0:
+                delays = (delay, late[0], skew[0])
+                sub_step.late(target, step, recordings, timestep, time, commands, found[2], delays)
+            else:
+                sub_step.on_time(target, step, candidates, commands, found)
+            changes = sub_step.differs(share, 1.0)
+            if sub_step.there(goals):
+                laws.travel(now, before, share, *goals)
+            if sub_step.there(kick):
+                laws.differ(now, before, share, *kick[1:])
+            sub_step.answer((error, torque, damping, own), limits, now, sensed, law, driving)
+            if changes:
+                sub_step.answer(then, limits, before, sensed, law, driving)
+                kernels.blend(error, torque, damping, then[0], then[1], then[2], share)
+                for i in range(n):
+                    own[i, 0] = share[i, 0] * own[i, 0] + (1 - share[i, 0]) * then[3][i, 0]
+            on[:] = 1.0
+            if len(off) > 0 and off[step, 0]:
+                sub_step.switch(on, step, time / timestep, candidates, power, skew[0])
+                for i in range(n):
+                    torque[i, 0] *= on[i, 0]
+                    damping[i, 0] *= on[i, 0]
+                    own[i, 0] *= on[i, 0]
             for i in range(n):
-                share = target[2][i, 0]
-                own[i, 0] = share * own[i, 0] + (1 - share) * then[3][i, 0]
-        on = room[16, :n]
-        on[:] = 1.0
-        if len(off) > 0 and off[step, 0]:
-            sub_step.switch(on, step, time / timestep, candidates, power, skew[0])
+                was[i, 0], acted[i, 0], braked[i, 0] = felt[i, 0], torque[i, 0], damping[i, 0]
+                net[i, 0] = torque[i, 0] - damping[i, 0] * felt[i, 0]
+                viscous[i, 0] = outside[i, 0]
+            sub_step.settle(error, net, on, time, settling)
+            kernels.split(torque, damping, brake, viscous, felt, *law[10:])
             for i in range(n):
-                torque[i, 0] *= on[i, 0]
-                damping[i, 0] *= on[i, 0]
-                own[i, 0] *= on[i, 0]
-        felt, net = sensed[1], room[17, :n]
-        for i in range(n):
-            was[i, 0], acted[i, 0], braked[i, 0] = felt[i, 0], torque[i, 0], damping[i, 0]
-            net[i, 0] = torque[i, 0] - damping[i, 0] * felt[i, 0]
-        sub_step.settle(error, net, on, time, settling)
-        brake, viscous = room[18, :n], room[19, :n]
-        viscous[:] = outside[:n]
-        kernels.split(torque, damping, brake, viscous, felt, *law[10:])
-        angle, coming = net, room[20, :n]
-        for i in range(n):
-            turned = sub_step.there(train) and has_motor[i, 0] != 0
-            angle[i, 0] = motor[i, 0] if turned else link[0][i, 0]
-            coming[i, 0] = 2 * felt[i, 0] - last[i, 0]
-            last[i, 0] = felt[i, 0]
-        sub_step.flow((torque, damping, brake, viscous), (angle, felt, coming), link, own, flowing)
-        for i in range(n):
-            force[i, 0] = torque[i, 0] - brake[i, 0]
-            damped[i, 0] = damping[i, 0] + viscous[i, 0]
-        moved = ids[:n], left[:n]
-        one_joint.advance(qpos, qvel, force, damped, forces, inertia, ranges, *moved, timestep)
-        if np.any(left[:n]):
-            return step
-    return steps
+                turned = sub_step.there(train) and has_motor[i, 0] != 0
+                angle[i, 0] = motor[i, 0] if turned else link[0][i, 0]
+                coming[i, 0] = 2 * felt[i, 0] - last[i, 0]
+                last[i, 0] = felt[i, 0]
+            acts = (torque, damping, brake, viscous)
+            sub_step.flow(acts, (angle, felt, coming), link, own, flowing)
+            for i in range(n):
+                force[i, 0] = torque[i, 0] - brake[i, 0]
+                damped[i, 0] = damping[i, 0] + viscous[i, 0]
+            one_joint.advance(
+                qpos, qvel, force, damped, forces, inertia, ranges, active, still, timestep
+            )
+            if sub_step.differs(still, False):
+                return step
+            step += 1
+            sub_step.sense(sensed, link, train, bias, eccentricity)
+            trace[step, :n] = told[:, 0]
+    return step
 
 
 @functools.cache

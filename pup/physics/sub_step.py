@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from pup.physics import kernels
-from pup.physics.kernels import Array, Index, part
+from pup.physics.kernels import Array, Index, Mask, part
 from pup.physics.terms import kernels as laws
 from pup.physics.terms.base import Parts
 
@@ -20,6 +20,15 @@ Terms = tuple[Parts, ...]
 def there(term: Parts) -> bool:
     """Whether a term is."""
     return len(term[0]) > 0
+
+
+@part
+def differs(values: Array | Mask, usual: float) -> bool:
+    """Whether any is not as usual."""
+    some = False
+    for i in range(len(values)):
+        some |= values[i, 0] != usual
+    return some
 
 
 @part
