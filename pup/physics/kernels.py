@@ -4,17 +4,16 @@ A call of NumPy costs more than all arithmetic of a few simulations; each functi
 loop over simulations and joints what would take tens of calls.
 
 Arrays have a row for each simulation and a column for each joint; those of timesteps have one
-column. The first simulations are active, as many as `velocity` or else the first argument has rows:
-other arrays may have more, which are left alone. What is computed for a simulation depends on its
+column. The first simulations are active, as many as the motion or else the torque has rows: other
+arrays may have more, which are left alone. What is computed for a simulation depends on its
 own row only.
 """
 
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 import numba
@@ -34,6 +33,15 @@ _TYPES = {Array: ARRAY, Mask: MASK, Index: INDEX, Ids: IDS, float: numba.float64
 """Strides of any kind, so that a function is compiled once whatever arrays are views of."""
 
 
+def digest(*modules: str | None) -> str:
+    """What the sources of some modules, by their files, come to."""
+    sources = b"".join(Path(str(module)).read_bytes() for module in modules)
+    return hashlib.sha256(sources).hexdigest()[:16]
+
+
+_OWN = digest(__file__)
+
+
 def _compile(make: Callable[..., Any], function: Callable[..., Any], *types: object) -> Any:
     """Compile, and keep the outcome for the next process where some folder can be written."""
     try:
@@ -43,41 +51,37 @@ def _compile(make: Callable[..., Any], function: Callable[..., Any], *types: obj
 
 
 def kernel(function: Callable[P, None]) -> Callable[P, None]:
-    """Compile a function for the types that it names; divisions by zero are as in NumPy."""
+    """Compile a function for the types that it names; divisions by zero are as in NumPy.
+
+    It may call what is compiled in this module, and in its own.
+    """
     hints = get_type_hints(function)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     signature = numba.void(*(_TYPES[hints[name]] for name in names))
-    make = functools.partial(numba.njit, nogil=True, error_model="numpy")
-    compiled: Callable[P, None] = _compile(make, function, signature)
+    compiled: Callable[P, None] = assembled(function, signature, _OWN)
     return compiled
 
 
 def part(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that only compiled ones call, for the types that they call it with."""
-    compiled: Callable[P, R] = numba.njit(nogil=True, error_model="numpy", inline="always")(
-        function
-    )
+    make = numba.njit(nogil=True, error_model="numpy", inline="always")
+    compiled: Callable[P, R] = make(function)
     return compiled
 
 
-def assembled(
-    signature: object, modules: Sequence[ModuleType]
-) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def assembled(function: Callable[P, R], signature: object, made_of: str) -> Callable[P, R]:
     """Compile a function that calls compiled ones of other modules.
 
-    What Numba has kept it holds against the function's own file alone. So the name by which it is
-    kept tells of the others.
+    Args:
+      function: what to compile.
+      signature: its types.
+      made_of: digest of these modules. Numba holds what it has kept against the function's own file
+        alone, so the name by which it is kept tells of the others.
     """
-    sources = b"".join(Path(str(module.__file__)).read_bytes() for module in modules)
-    made_of = hashlib.sha256(sources).hexdigest()[:16]
-
-    def compile_now(function: Callable[P, R]) -> Callable[P, R]:
-        function.__qualname__ = f"{function.__name__}_{made_of}"
-        make = functools.partial(numba.njit, nogil=True, error_model="numpy")
-        compiled: Callable[P, R] = _compile(make, function, signature)
-        return compiled
-
-    return compile_now
+    function.__qualname__ = f"{function.__name__}_{made_of}"
+    make = functools.partial(numba.njit, nogil=True, error_model="numpy")
+    compiled: Callable[P, R] = _compile(make, function, signature)
+    return compiled
 
 
 def _implicit_share(damping: float, inertia: float, timestep: float) -> float:

@@ -6,6 +6,7 @@ same kernels. What simulations begin with is left to it: the first sub-step come
 """
 
 import functools
+import threading
 from collections.abc import Callable, Sequence
 from typing import Self
 
@@ -17,7 +18,7 @@ from pup.physics import kernels, one_joint, sub_step
 from pup.physics.actuators import PD
 from pup.physics.commands import Commands
 from pup.physics.encoders import Readings
-from pup.physics.kernels import Array, Ids, Index, Mask, assembled
+from pup.physics.kernels import Array, Ids, Index, Mask, assembled, digest
 from pup.physics.one_joint import OneJoint
 from pup.physics.servo import Servos
 from pup.physics.sub_step import Terms
@@ -210,8 +211,8 @@ def _move(
     train, bias, eccentricity = terms[20], terms[23], terms[24]
     driving = (band, asymmetry, integral, kick, drift, supply, speed)
     settling, flowing = (integral, drift, supply), terms[10:23]
-    was, acted, braked, outside = law[4], law[5], law[6], law[9]
-    motor, has_motor = train[0], train[8]
+    _, _, _, _, was, acted, braked, _, _, outside = law[:10]  # see LimitedLaw.parts
+    motor, has_motor = train[0], train[8]  # see Drivetrain.parts
     qpos, qvel, force, damped = state
     forces, inertia, ranges = fixed
     room, step, n = np.empty((22, len(ids), 1)), first, running[first - 1, 0] * candidates
@@ -281,8 +282,17 @@ def _move(
     return step
 
 
+_MODULES = kernels, one_joint, sub_step, laws.friction, laws.link, laws.servo
+_MADE_OF = digest(*(module.__file__ for module in _MODULES))
+_COMPILING = threading.Lock()
+
+
 @functools.cache
+def _compile() -> Callable[..., int]:
+    return assembled(_move, _SIGNATURE, _MADE_OF)
+
+
 def _compiled() -> Callable[..., int]:
-    """`_move` compiled, by those who need it: for the first time it takes twenty seconds."""
-    modules = kernels, one_joint, sub_step, laws.friction, laws.link, laws.servo
-    return assembled(_SIGNATURE, modules)(_move)
+    """`_move` compiled, by the first who needs it: that takes some twenty seconds."""
+    with _COMPILING:
+        return _compile()

@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 SIMULATIONS = 512
 """Simulations in a batch: enough to hide what calls cost, few enough to stay in cache."""
 
+KEPT = 4_000_000
+"""Sub-steps of a batch whose readings are kept, all simulations together: 32 MB."""
+
 _BROKEN = slice(mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC + 1)
 """Warnings of broken positions, velocities and accelerations."""
 
@@ -112,7 +115,10 @@ class MujocoSimulator:
 
     def _parts(self, group: Group, candidates: int) -> list[slice]:
         """The candidates in parts of one batch each, equally many parts for every thread."""
-        most = max(1, SIMULATIONS // len(group.setups))
+        together = SIMULATIONS
+        if len(self.robot.joints) == 1:  # whose every sub-step is kept, see `loop`
+            together = min(together, KEPT // len(group.running))
+        most = max(1, together // len(group.setups))
         each = -(-candidates // (most * self.threads))
         parts = min(candidates, each * self.threads)
         edges = np.linspace(0, candidates, parts + 1).astype(int)

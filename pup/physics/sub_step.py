@@ -48,7 +48,16 @@ def sense(sensed: Parts, link: Parts, train: Parts, bias: Parts, eccentricity: P
 def on_time(
     target: Parts, step: int, candidates: int, commands: Parts, found: tuple[Index, ...]
 ) -> None:
-    """Targets that arrive at once; see Commands.on_time."""
+    """Targets that arrive at once; see Commands.on_time.
+
+    Args:
+      target: the one at the sub-step's end, the one before, and for which share the first holds;
+        written.
+      step: the sub-step.
+      candidates: of each recording.
+      commands: see Commands.tables, like the next.
+      found: where they stand.
+    """
     now, before, share = target
     flat, _, shares = commands
     for i in range(len(now)):
@@ -69,7 +78,18 @@ def late(
     newest: Index,
     delays: Parts,
 ) -> None:
-    """Targets that arrive late; see Commands.late."""
+    """Targets that arrive late; see Commands.late.
+
+    Args:
+      target: see `on_time`.
+      step: the sub-step.
+      recordings: that have not ended.
+      timestep: s.
+      time: by which clocks drift, s.
+      commands: see Commands.tables.
+      newest: see there.
+      delays: two of commands, s, and the share by which clocks go slow; empty for none.
+    """
     now, before, share = target
     candidates = len(now) // recordings
     held = np.empty((5, recordings, candidates))
@@ -105,10 +125,10 @@ def switch(on: Array, step: int, shift: float, candidates: int, power: Array, sk
     Args:
       on: written.
       step: the sub-step.
-      shift: time since the start in sub-steps, by which a clock that is slow shifts it.
-      candidates: how many there are.
-      power: of the recordings.
-      skew: of clocks.
+      shift: time by which clocks drift, sub-steps.
+      candidates: of each recording.
+      power: share of the torque, shape (n_steps, n_recordings).
+      skew: share by which clocks go slow; empty for none.
     """
     last = len(power) - 1
     for i in range(len(on)):

@@ -58,7 +58,7 @@ class Friction(Term):
         kernels.rub(flow.torque, flow.damping, bend, flow.velocity, flow.coming, level, *fixed)
 
     def level(self, flow: Flow) -> Array:
-        """Friction torque of a joint that slips, N m, the rows of all simulations."""
+        """Friction torque of joints that slip, N m; of simulations that have ended it is old."""
         raise NotImplementedError
 
     def grip(self) -> Parts:

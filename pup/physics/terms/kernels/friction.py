@@ -34,7 +34,7 @@ def rub(
       torque: on its way to the link, N m; changed in place.
       damping: applied times the velocity at the end, N m s/rad; changed in place.
       bend: of the bristle, as a share of where it slips; changed in place.
-      velocity: of the link, rad/s.
+      velocity: of what it acts on, rad/s.
       coming: what it will be at the sub-step's end, rad/s.
       level: torque at which the bristle slips, N m.
       length: how far a joint gives before it slips, rad.

@@ -23,7 +23,7 @@ def travel(
       now: the command at the sub-step's end, rad; to the goal's mean while it holds, in place.
       before: the one at its beginning, rad; the same.
       share: of the sub-step for which `now` holds; a single row or column stands for all.
-      timestep: s; a single row stands for all.
+      timestep: s.
       rate: largest speed of a goal, rad/s.
       acceleration: at which that speed changes, rad/s².
       limited: 1 where there is such a limit, else 0.
@@ -31,7 +31,7 @@ def travel(
       speed: of the goal, rad/s; changed in place.
     """
     for i in range(now.shape[0]):
-        step = timestep[min(i, timestep.shape[0] - 1), 0]
+        step = timestep[i, 0]
         for j in range(now.shape[1]):
             if limited[i, j] == 0:
                 goal[i, j], speed[i, j] = now[i, j], 0.0
@@ -313,7 +313,7 @@ def lag(
     Args:
       torque: on its way to the link, N m; changed in place.
       damping: applied times the velocity at the end, N m s/rad; changed in place.
-      velocity: of the link, rad/s.
+      velocity: of what it acts on, rad/s.
       law: the law's own damping, which does not wait, N m s/rad.
       inertia: what a joint's torque accelerates, kg m².
       timestep: s.
