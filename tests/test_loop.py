@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,8 +63,8 @@ def both(
     known = Loop.of
     simulator = MujocoSimulator(BENCH, runs, "pd", lead=lead)
 
-    def seen(*args: object) -> Loop | None:
-        loops.append(known(*args))  # type: ignore[arg-type]
+    def seen(*args: Any) -> Loop | None:
+        loops.append(known(*args))
         return loops[-1]
 
     with monkeypatch.context() as patched:

@@ -93,9 +93,7 @@ class History:
         if self.age is None:
             before, after = (self.values[(last + i) % 2, rows] for i in (0, 1))
             return np.asarray(before + fraction * (after - before))
-        since = np.maximum(fraction - self.age[rows], -last)  # it stood still before the start
-        floor = np.floor(since)
-        whole, share = last + floor.astype(np.int64), since - floor
+        whole, share = aged(last, fraction, self.age[rows])
         depth, column = len(self.values), np.arange(self.values.shape[2])
         before, after = (self.values[(whole + i) % depth, rows[:, None], column] for i in (0, 1))
         return np.asarray(before + share * (after - before))
@@ -108,3 +106,18 @@ class History:
     def restore(self, state: Array) -> None:
         """Take up a state of simulations that were all started by `begin`."""
         self.values[:], self.count = state.swapaxes(0, 1), len(self.values)
+
+
+def aged(
+    step: int | NDArray[np.int64], fraction: Array, age: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """When it was that old readings are of, as a sub-step and a share of the next.
+
+    Args:
+      step: the last sub-step before they are read.
+      fraction: how far after it, of one.
+      age: how old they are, sub-steps; what is older than the start stood still before it.
+    """
+    since = np.maximum(fraction - age, -step)
+    floor = np.floor(since)
+    return step + floor.astype(np.int64), since - floor

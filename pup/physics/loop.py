@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pup.physics import kernels, one_joint, sub_step
 from pup.physics.actuators import PD
 from pup.physics.commands import Commands
-from pup.physics.encoders import Readings
+from pup.physics.encoders import Readings, aged
 from pup.physics.kernels import Array, Ids, Index, Mask, assembled, digest
 from pup.physics.one_joint import OneJoint
 from pup.physics.servo import Servos
@@ -145,9 +145,7 @@ class Loop:
         """
         whole, share = ticks.step[:, None], ticks.fraction[:, None]
         if age is not None:
-            since = np.maximum(share - age[rows, 0], -whole)  # it stood still before the start
-            floor = np.floor(since)
-            whole, share = whole + floor.astype(np.int64), since - floor
+            whole, share = aged(whole, share, age[rows, 0])
         before, after = self.told[whole, rows], self.told[whole + 1, rows]
         return np.asarray(before + share * (after - before))
 

@@ -373,12 +373,12 @@ class Run:
 
     def _sound(self, rows: NDArray[np.int64], values: Array) -> Array:
         """The values, NaN for simulations that have broken down."""
-        values[self._lost()[rows]] = np.nan
+        values[self._lost(rows)] = np.nan
         return values
 
-    def _lost(self) -> NDArray[np.bool_]:
-        """Which simulations have broken down."""
-        return np.asarray(self.broken | (self.warned > 0).any(axis=1))
+    def _lost(self, rows: NDArray[np.int64] | slice = slice(None)) -> NDArray[np.bool_]:
+        """Which of some simulations have broken down, or of all."""
+        return np.asarray(self.broken[rows] | (self.warned[rows] > 0).any(axis=1))
 
 
 def _write(to: Array, part: slice, event: Event, values: Array) -> None:

@@ -72,7 +72,7 @@ class ActuatorLag(Term):
         self._lagging = np.full_like(steps, np.nan)
         self._lagging_more = np.where(two, np.nan, 0.0)
         self._asked, self._ahead, self._asked_more, self._ahead_more = np.zeros((4, *steps.shape))
-        self._step = np.ones((len(steps), 1)) * self.scene.timestep
+        self._step = self.scene.steps()
 
     def parts(self) -> Parts:
         """See Term: of both stages alike, then of the first, and of the second."""
@@ -151,7 +151,7 @@ class ThermalDrift(Term):
         self._heat = self.values["load"] / self.scene.limit
         step = self.scene.timestep
         self._cooling = step / np.maximum(self.values["time"], step)
-        self._step = np.ones((len(self._warmth), 1)) * step
+        self._step = self.scene.steps()
 
     def parts(self) -> Parts:
         """See Term."""
@@ -214,7 +214,7 @@ class IntegralAction(Term):
         self._sum = np.zeros_like(self.values["gain"])
         self._most = self.values["share"] * self.scene.limit / np.maximum(self.values["gain"], 1e-9)
         self._least = -self._most
-        self._step = np.ones((len(self._sum), 1)) * self.scene.timestep
+        self._step = self.scene.steps()
 
     def parts(self) -> Parts:
         """See Term."""
@@ -262,7 +262,7 @@ class DerivativeKick(Term):
         self._goal = np.full_like(self.values["gain"], np.nan)
         self._rate = np.zeros_like(self._goal)
         self._pace = -self.scene.timestep / np.maximum(self.values["time"], 1e-9)
-        self._step = np.ones((len(self._goal), 1)) * self.scene.timestep
+        self._step = self.scene.steps()
 
     def parts(self) -> Parts:
         """See Term."""
@@ -320,7 +320,7 @@ class TargetRateLimit(Term):
         self._limited = np.where((slowness > 0) | (sluggishness > 0), 1.0, 0.0)
         self._goal = np.full_like(slowness, np.nan)
         self._speed = np.zeros_like(slowness)
-        self._step = np.ones((len(slowness), 1)) * self.scene.timestep
+        self._step = self.scene.steps()
 
     def parts(self) -> Parts:
         """See Term."""

@@ -83,6 +83,10 @@ class Scene:
     armature: Array
     limit: Array
 
+    def steps(self) -> Array:
+        """The sub-step of each simulation, shape (n_simulations, 1), s."""
+        return np.ones((len(self.inertia), 1)) * self.timestep
+
     def renew(self, rows: NDArray[np.int64], other: "Scene") -> None:
         """Give some simulations what another scene, which has one row for each, says.
 

@@ -31,7 +31,7 @@ class Friction(Term):
         self._bend = np.zeros_like(self.scene.inertia)  # as a share of where it slips
         self._load: Array | None = None
         self._length = self.length()
-        self._step = np.ones((len(self._bend), 1)) * self.scene.timestep
+        self._step = self.scene.steps()
         self._level = np.empty_like(self._bend)
 
     def parts(self) -> Parts:
@@ -59,11 +59,11 @@ class Friction(Term):
 
     def level(self, flow: Flow) -> Array:
         """Friction torque of joints that slip, N m; of simulations that have ended it is old."""
-        raise NotImplementedError
+        return self.grip()[0]
 
     def grip(self) -> Parts:
-        """What that depends on."""
-        raise NotImplementedError
+        """The level, which by itself is the same always, and what else it depends on."""
+        return (self.values["torque"],)
 
     def length(self) -> Array:
         """How far a joint gives before it slips, (n_simulations, n_joints), rad."""
@@ -76,14 +76,6 @@ class CoulombFriction(Friction):
     effect = "coulomb_friction"
     quantities = (Quantity("torque", "N m", 0.08, 1.0),)
     source = "BAM M1 of the MX-64 (arXiv:2410.08650): 0.09 N m"
-
-    def grip(self) -> Parts:
-        """See Friction."""
-        return (self.values["torque"],)
-
-    def level(self, flow: Flow) -> Array:
-        """See Friction."""
-        return self.values["torque"]
 
 
 class StribeckFriction(Friction):
@@ -159,14 +151,6 @@ class PreslidingHysteresis(Friction):
     def held(self, load: Array, gravity: Array) -> Array:
         """See Term: what bends a bristle that gives is not known; it starts relaxed."""
         return load
-
-    def grip(self) -> Parts:
-        """See Friction."""
-        return (self.values["torque"],)
-
-    def level(self, flow: Flow) -> Array:
-        """See Friction."""
-        return self.values["torque"]
 
     def length(self) -> Array:
         """See Friction."""

@@ -98,8 +98,7 @@ class Drivetrain(Term):
         bend = sum(part.give() * share for part, share in zip(parts, ahead, strict=True))
         self._play_seen = play / np.maximum(self._gap, 1e-12)
         self._bend_seen = bend / np.maximum(self._give, 1e-12)
-        self._active = (self._gap > 0) | (self._give > 0)
-        self._acts = self._active.astype(np.float64)
+        self._active = np.where((self._gap > 0) | (self._give > 0), 1.0, 0.0)
         self._first = np.full_like(self._gap, np.nan)
         self._ahead = np.zeros_like(self._gap)
         self.driven = np.zeros_like(self._gap)
@@ -113,7 +112,7 @@ class Drivetrain(Term):
     def prepare(self) -> None:
         """See Term."""
         step = self.scene.timestep
-        self._step = np.ones((len(self._gap), 1)) * step
+        self._step = self.scene.steps()
         self._rotor = np.maximum(self.scene.armature, LEAST) / step
         stiffness = 1 / np.maximum(self._give, 1e-9)
         swings = swinging(self._rotor * step, self.scene.model)
@@ -130,7 +129,7 @@ class Drivetrain(Term):
         """See Term: the rotor leaves the link."""
         armature, dofs = writer.field("dof_armature"), self.scene.model.dofs
         armature[:, dofs] = np.where(self._active, 0.0, armature[:, dofs])
-        np.copyto(self.scene.inertia, self.scene.armature, where=self._active)
+        np.copyto(self.scene.inertia, self.scene.armature, where=self._active > 0)
 
     def sense(self, position: Array, velocity: Array) -> tuple[Array, Array]:
         """See Term."""
@@ -147,12 +146,12 @@ class Drivetrain(Term):
         return (*moved, self._torque, self._damping)
 
     def _seen(self) -> Parts:
-        starts = self._first, self._ahead, self._acts, self._gap
+        starts = self._first, self._ahead, self._active, self._gap
         return (*starts, self._play_seen, self._bend_seen, self._step)
 
     def _between(self) -> Parts:
         springs = self._give, self._rotor, self._reach, self._past
-        return (self._acts, self._gap, *springs, self._step)
+        return (self._active, self._gap, *springs, self._step)
 
     def turned(self, position: Array) -> Array:
         """Angles of what servos turn, their motors or else their links, (n_active, n_joints), rad.
