@@ -87,7 +87,7 @@ def test_a_wrong_term_is_refused(tmp_path: Path, old: str, new: str, words: str)
 
 UNPHYSICAL = [
     ("backlash", "slack", "term[1]: there is no effect 'slack'; known: command_delay,"),
-    ("gap", "width", "term[1]: backlash has no 'width'; it has: gap, behind"),
+    ("gap", "width", "term[1]: backlash has no 'width'; it has: gap, behind, drag"),
     ("0.02", "-0.02", "term[1]: gap = -0.02: backlash takes no negative gap"),
     ("voltage_sag", "payload", "term[2]: payload cannot act at bus; it acts at a body"),
 ]

@@ -191,7 +191,7 @@ def test_effects_of_the_ground_compose() -> None:
 
 BAD = [
     ("slack/gap@joint:l_knee", "there is no effect 'slack'; known: command_delay,"),
-    ("backlash/width@joint:l_knee", "backlash has no 'width'; it has: gap, behind"),
+    ("backlash/width@joint:l_knee", "backlash has no 'width'; it has: gap, behind, drag"),
     ("backlash/gap@limb:l_knee", "place 'limb:l_knee': 'limb' is none of joint, group,"),
     ("backlash/gap@joint:knee", "place joint:knee: the robot has no joint of that name"),
     ("backlash/gap@group:l_knee", "place group:l_knee: the robot has no group of that name"),

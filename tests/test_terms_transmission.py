@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from terms import (
     AT,
     BENCH,
     INERTIA,
     KP,
     LEVER,
+    SERVO,
     STEP,
     Array,
     G,
@@ -54,6 +56,25 @@ def test_an_encoder_behind_the_play_sees_it_rattle_through() -> None:
     rising = run.time > 0.5
     assert np.abs(late[rising & (run.target[:, 0] < -0.05)]).max() < 1e-3
     assert np.abs(late).max() > 2e-3
+
+
+@pytest.mark.parametrize("drag", [0.0, 0.002, 0.02])
+def test_what_is_loose_takes_its_motor_along_by_the_drag_in_its_play(drag: float) -> None:
+    """A pendulum that never reaches the end of its play, and a rotor that nothing else holds."""
+    time = np.arange(1500) * STEP
+    off = {"torque_enabled": np.zeros(len(time))}
+    run = recording(BENCH, time, np.zeros(len(time)), 0.05, extras=off)
+    (swing,) = bench(run, {f"backlash/gap{AT}": 1.0, f"backlash/drag{AT}": drag})
+    rotor = SERVO["armature"]
+    link = INERTIA - rotor
+
+    def law(_: float, state: Array) -> list[float]:
+        angle, speed, own = state
+        held = drag * (speed - own)
+        return [speed, -(LEVER * G * np.sin(angle) + held) / link, held / rotor]
+
+    way = solve_ivp(law, (0, time[-1]), [0.05, 0.0, 0.0], t_eval=time, rtol=1e-9, atol=1e-12)
+    assert swing == pytest.approx(way.y[0], abs=3e-4)
 
 
 @pytest.mark.parametrize("effect", ["joint_compliance", "structural_flex"])

@@ -183,6 +183,13 @@ def test_noise_that_is_not_well_known_is_no_reason_to_doubt() -> None:
     assert doubt(gained / 100, left_over(model, sure)) > doubt(gained, left_over(model, sure))
 
 
+def test_what_rattles_may_leave_more() -> None:
+    """Of the same share that is left, play is doubted less than friction, and of none as little."""
+    assert doubt(100.0, 50.0, "lost_motion") < 0.5 < doubt(100.0, 50.0, "friction")
+    assert doubt(100.0, 50.0, "friction") == doubt(100.0, 50.0)
+    assert doubt(100.0, 0.0, "lost_motion") == doubt(100.0, 0.0)
+
+
 def found(effect: str, gain: float, size: float, probability: float = 0.9) -> Finding:
     place = Place("joint", BENCH.joint_names[0])
     return Finding(effect, place, "", (), {}, probability, (), {}, None, gain, size)

@@ -151,7 +151,7 @@ def findings(
         gain = less.chi2 - final.fit.chi2
         chosen = chosen_in(rounds, hypothesis.key)
         # What is hardly more than chance counts little, and so comes after what explains much.
-        known = 1 - doubt(gain, left + selector.enough)
+        known = 1 - doubt(gain, left + selector.enough, hypothesis.family)
         probability, rivals = _rivals(hypothesis, chosen, selector, known)
         told.append(
             Finding(

@@ -48,7 +48,7 @@ PARTS = {
     "friction_asymmetry": 7,
     "quadratic_damping": 1,
     "cogging": 3,
-    "drivetrain": 21,
+    "drivetrain": 22,
     "joint_spring": 2,
     "joint_stop": 7,
     "encoder_bias": 1,

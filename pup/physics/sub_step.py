@@ -250,12 +250,12 @@ def flow(acted: Parts, motion: Parts, link: Parts, own: Array, terms: Terms) -> 
     if there(cogging):
         laws.ripple(torque, angle, *cogging)
     if there(train):
-        before = train[20]
+        before = train[21]
         for i in range(len(position)):
             now = speed[i, 0]
             angle[i, 0], velocity[i, 0], coming[i, 0] = position[i, 0], now, 2 * now - before[i, 0]
             before[i, 0] = now
-        laws.engage(torque, damping, brake, viscous, position, speed, *train[:6], *train[13:20])
+        laws.engage(torque, damping, brake, viscous, position, speed, *train[:6], *train[13:21])
     if there(spring):
         laws.pull(torque, position, *spring)
     if there(stop):

@@ -64,6 +64,10 @@ class Transmission(Term):
         """Compliance, same shape, rad/(N m)."""
         return np.zeros_like(self.scene.inertia)
 
+    def drag(self) -> Array:
+        """What holds motor and link together within the play, same shape, N m s/rad."""
+        return np.zeros_like(self.scene.inertia)
+
     def behind(self) -> Array:
         """Share of the play and give that the encoder is behind: 0 at the motor, 1 at the link."""
         raise NotImplementedError
@@ -92,6 +96,7 @@ class Drivetrain(Term):
     def __init__(self, parts: Sequence[Transmission], scene: Scene) -> None:
         self._gap = np.asarray(sum(part.gap() for part in parts))
         self._give = np.asarray(sum(part.give() for part in parts))
+        self._drag = np.asarray(sum(part.drag() for part in parts))
         # Of the play and of the give, what an encoder sees that is not behind them.
         ahead = [1 - part.behind() for part in parts]
         play = sum(part.gap() * share for part, share in zip(parts, ahead, strict=True))
@@ -151,7 +156,7 @@ class Drivetrain(Term):
 
     def _between(self) -> Parts:
         springs = self._give, self._rotor, self._reach, self._past
-        return (self._active, self._gap, *springs, self._step)
+        return (self._active, self._gap, self._drag, *springs, self._step)
 
     def turned(self, position: Array) -> Array:
         """Angles of what servos turn, their motors or else their links, (n_active, n_joints), rad.
@@ -203,18 +208,27 @@ class Drivetrain(Term):
 
 
 class Backlash(Transmission):
-    """Play between motor and link."""
+    """Play between motor and link, with a viscous drag in it.
+
+    The dead zone with inner damping of Nordin, Galic and Gutman, "New models for backlash and gear
+    play" (International Journal of Adaptive Control and Signal Processing, 1997).
+    """
 
     effect = "backlash"
     quantities = (
         Quantity("gap", "rad", 0.006, 0.06),
         Quantity("behind", "1", 1.0, 1.0, grid=(0.0, 1.0)),
+        Quantity("drag", "N m s/rad", 0.001, 0.02, grid=(0.001,)),
     )
-    source = "half of 0.01 to 0.035 rad: Webots' OP2, SO-101, microduck"
+    source = "half of 0.01 to 0.035 rad: Webots' OP2, SO-101, microduck; drag: estimate"
 
     def gap(self) -> Array:
         """See Transmission."""
         return self.values["gap"]
+
+    def drag(self) -> Array:
+        """See Transmission."""
+        return np.asarray(np.where(self.values["gap"] > 0, self.values["drag"], 0.0))
 
     def behind(self) -> Array:
         """See Transmission."""

@@ -84,6 +84,7 @@ def engage(
     reached_damping: Array,
     active: Array,
     gap: Array,
+    drag: Array,
     give: Array,
     rotor: Array,
     reach: Array,
@@ -109,6 +110,7 @@ def engage(
       reached_damping: the same times the link's velocity, N m s/rad; written.
       active: 1 where there is a motor of its own, else 0.
       gap: half of the play, rad.
+      drag: within the play, N m s/rad.
       give: compliance, rad/(N m).
       rotor: its inertia over the timestep, kg m²/s.
       reach: time by which the velocity at the end bends the give, s.
@@ -121,7 +123,8 @@ def engage(
             alone = (rotor[i, j] * speed[i, j] + torque[i, j] - brake[i, j]) / heavy
             ahead = own[i, j] - position[i, j]
             coming = ahead + timestep[i, 0] * (alone - velocity[i, j])
-            through, grip = 0.0, 0.0
+            grip = drag[i, j] / (1 + drag[i, j] / heavy)
+            through = grip * alone
             if abs(coming) >= gap[i, j]:
                 grip = reach[i, j] / (give[i, j] + reach[i, j] / heavy)
                 beyond = ahead - math.copysign(gap[i, j], coming)
