@@ -40,20 +40,20 @@ def test_terms_of_a_description_are_columns_behind_the_nominal_parameters(tmp_pa
     own = slice(len(before), None)
     assert space.names[: own.start] == before.names
     assert space.names[own] == (
-        "backlash/gap@joint:l", "backlash/behind@joint:l",
+        "backlash/gap@joint:l", "backlash/behind@joint:l", "backlash/drag@joint:l",
         "voltage_sag/drop@bus", "voltage_sag/buffer@bus",
     )  # fmt: skip
-    assert space.units[own] == ("rad", "1", "1/(N m)", "s")
-    assert space.nominal[own].tolist() == [0.02, 0.5, 0.9, 0.02]
-    assert space.lower[own].tolist() == [0.0, 0.0, 0.0, 0.001]
-    assert space.upper[own].tolist() == [0.06, 1.0, 0.9, 0.2]
+    assert space.units[own] == ("rad", "1", "N m s/rad", "1/(N m)", "s")
+    assert space.nominal[own].tolist() == [0.02, 0.5, 0.001, 0.9, 0.02]
+    assert space.lower[own].tolist() == [0.0, 0.0, 0.001 / 3, 0.0, 0.001]
+    assert space.upper[own].tolist() == [0.06, 1.0, 0.02, 0.9, 0.2]
 
 
 def test_a_value_left_out_is_the_nominal_one(tmp_path: Path) -> None:
     """A size is then zero: a term without any does nothing."""
     text = ROBOT + TERM[: TERM.index("values")]
     robot = RobotDescription.load(robot_folder(tmp_path, text))
-    assert robot_space(robot, "pd").nominal[-2:].tolist() == [0.0, 1.0]
+    assert robot_space(robot, "pd").nominal[-3:].tolist() == [0.0, 1.0, 0.001]
 
 
 WRONG_TERM = [
