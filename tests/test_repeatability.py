@@ -73,6 +73,15 @@ def test_what_happens_in_one_of_two_repeats_is_found_where_and_when_it_does() ->
         assert window.start < STUCK[1]
 
 
+def test_what_a_model_foretells_of_it_repeats_as_noise() -> None:
+    """A noise floor by a model that foretold less is no reason to say that a joint does not."""
+    runs = recordings(NONE)
+    measured = Measured.of(BENCH, runs)
+    far_off = noise_floor(measured, noise_of(runs) + 0.03 * stuck(runs))
+    assert far_off.sigma[0] > 0.01
+    assert unrepeated(measured, noise_of(runs), far_off, []) is None
+
+
 def test_a_joint_that_is_still_on_its_way_flutters_no_more() -> None:
     """It swings for a quarter of the time, command or not."""
     runs = recordings(NONE)

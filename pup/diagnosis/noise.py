@@ -87,7 +87,7 @@ def noise_floor(measured: Measured, errors: Array) -> Noise:
         # On the ground, impacts make motions differ everywhere, and no rest tells the noise alone.
         ground = any(measured.recordings[a].support == "ground" for a, _ in pairs)
         late = None if ground else lateness(differing, _least(measured))
-        told = _spreads(differing)
+        told = spreads(differing)
         readings = [spread.readings for spread in told.values()]
         if late:
             told = {c: replace(told[c], sigma=s, rho=late.rho) for c, s in late.sigma.items()}
@@ -196,7 +196,7 @@ def _pooled(
     return Noise(sigma, rho, source, readings)
 
 
-def _spreads(differences: Sequence[Difference]) -> dict[int, Spread]:
+def spreads(differences: Sequence[Difference]) -> dict[int, Spread]:
     """Noise of each channel, by what differs."""
     by_channel: dict[int, list[Array]] = {}
     for difference in differences:

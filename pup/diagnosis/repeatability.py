@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pup.diagnosis.laws import NAMELESS
 from pup.diagnosis.locate import BAND
-from pup.diagnosis.noise import differences, flutter, quanta
+from pup.diagnosis.noise import differences, flutter, quanta, spreads
 from pup.diagnosis.regimes import Regime, strongest, windows
 from pup.diagnosis.residuals import Measured, Noise
 from pup.diagnosis.verdict import Finding, Parameter
@@ -30,7 +30,8 @@ def unrepeated(
 ) -> Finding | None:
     """The joint whose repeats differ most, where that is more than its readings' noise.
 
-    On the ground it is not asked for: impacts make motions differ everywhere.
+    On the ground it is not asked for: impacts make motions differ everywhere. What the model
+    foretells of it is no such thing: a loop that all but swings differs each time.
 
     Args:
       measured: the samples.
@@ -40,16 +41,20 @@ def unrepeated(
     """
     if noise.source != "repeats" or any(r.support == "ground" for r in measured.recordings):
         return None
-    apart = [_apart(measured, errors, noise, i) for i in range(len(measured.robot.joints))]
+    differing = differences(measured, errors)
+    left = noise.sigma.copy()
+    for channel, told in spreads(differing).items():
+        left[channel] = min(left[channel], told.sigma)
+    apart = [_apart(measured, errors, left[i], i) for i in range(len(measured.robot.joints))]
     joint = int(np.argmax(apart))
     if apart[joint] < APART:
         return None
     squares, readings = np.zeros(len(errors)), 0
-    for difference in differences(measured, errors):
+    for difference in differing:
         if difference.channel == joint:
             squares[difference.samples] += difference.errors**2
             readings += len(difference.errors)
-    spread, hidden = float(noise.sigma[joint]), 1 - 1 / apart[joint] ** 2
+    spread, hidden = float(left[joint]), 1 - 1 / apart[joint] ** 2
     flutters = spread / apart[joint]
     reach = BAND / np.sqrt(2 * max(readings, 1))
     return Finding(
@@ -69,10 +74,10 @@ def unrepeated(
     )
 
 
-def _apart(measured: Measured, errors: Array, noise: Noise, channel: int) -> float:
+def _apart(measured: Measured, errors: Array, spread: float, channel: int) -> float:
     """What differs between repeats of a joint, in units of its flutter; 0 if unknown."""
     told = flutter(measured, errors, channel)
     if told is None:
         return 0.0
     least = float(quanta(measured)[channel] / np.sqrt(12))
-    return float(noise.sigma[channel]) / max(told, least, 1e-300)
+    return float(spread) / max(told, least, 1e-300)
