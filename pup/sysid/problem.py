@@ -20,7 +20,7 @@ from pup.sysid.memory import memory
 
 Array = NDArray[np.float64]
 
-MODEL = 12
+MODEL = 13
 """Raised with every change of the physics or the loss, which makes old checkpoints another's."""
 MEMORY = 256 * 2**20
 """Bytes that trajectories and what equation 1 makes of them may take at once, about."""
