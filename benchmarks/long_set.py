@@ -1,7 +1,7 @@
 """A concealed Darwin with 15 recordings of 8 s, made as sealed cases are, to time diagnosis on.
 
 `python -m benchmarks.long_set --out DIR` writes DIR/recordings and DIR/truth.json, which takes some
-four minutes; then `pup diagnose DIR/recordings --robot darwin_op2 --out VERDICT --cores 2`.
+minutes; then `pup diagnose DIR/recordings --robot darwin_op2 --out VERDICT --cores 2`.
 """
 
 import argparse

@@ -45,7 +45,7 @@ def unrepeated(
     left = noise.sigma.copy()
     for channel, told in spreads(differing).items():
         left[channel] = min(left[channel], told.sigma)
-    apart = [_apart(measured, errors, left[i], i) for i in range(len(measured.robot.joints))]
+    apart = [_apart(measured, errors, float(left[i]), i) for i in range(len(measured.robot.joints))]
     joint = int(np.argmax(apart))
     if apart[joint] < APART:
         return None
@@ -80,4 +80,4 @@ def _apart(measured: Measured, errors: Array, spread: float, channel: int) -> fl
     if told is None:
         return 0.0
     least = float(quanta(measured)[channel] / np.sqrt(12))
-    return float(spread) / max(told, least, 1e-300)
+    return spread / max(told, least, 1e-300)

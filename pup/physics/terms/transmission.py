@@ -227,7 +227,7 @@ class Backlash(Transmission):
         return self.values["gap"]
 
     def drag(self) -> Array:
-        """See Transmission."""
+        """See Transmission: none of a term that has no play, where another has some."""
         return np.asarray(np.where(self.values["gap"] > 0, self.values["drag"], 0.0))
 
     def behind(self) -> Array:

@@ -123,6 +123,7 @@ def engage(
             alone = (rotor[i, j] * speed[i, j] + torque[i, j] - brake[i, j]) / heavy
             ahead = own[i, j] - position[i, j]
             coming = ahead + timestep[i, 0] * (alone - velocity[i, j])
+            # Where they do not meet, the drag pulls by the velocities at the sub-step's end.
             grip = drag[i, j] / (1 + drag[i, j] / heavy)
             through = grip * alone
             if abs(coming) >= gap[i, j]:
