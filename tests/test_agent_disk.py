@@ -58,6 +58,7 @@ def test_a_full_disk_keeps_a_robot_standing_and_its_trials_waiting(tmp_path: Pat
             wait(lambda: made.health()["stage"] == "ending", 60, made.log)
             assert not [f for f in gateway.of(Finished) if f.trial == "b"]
         wait(lambda: made.health()["stage"] == "none", 20, made.log)
+        wait(lambda: any(f.trial == "b" for f in gateway.of(Finished)), 20, made.log)
         (end,) = {f for f in gateway.of(Finished) if f.trial == "b"}
         assert end.state is Outcome.SUCCEEDED and end.distance is not None
         assert end.recording is not None

@@ -107,6 +107,7 @@ def test_bounds_lead_to_their_report(open_page):
     page.get_by_text("cannot be shown: Invalid JSON").wait_for()
     page.get_by_text("nothing is written yet").wait_for()
     page.get_by_role("link", name="job-fit").click()
+    page.wait_for_url("**/bounds/job-fit")
     rows = page.locator("tbody tr")
     pictures = page.locator("svg.range")
     assert rows.count() == pictures.count() > 2
