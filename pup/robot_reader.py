@@ -14,6 +14,7 @@ from pup.robot_parts import (
 from pup.robot_toml import Table, listed
 
 TIMESTEPS = (1e-5, 0.02)  # s
+USUAL_TIMESTEP = 0.002  # s
 
 
 def read_joints(table: Table, model: MjcfNames) -> tuple[Joint, ...]:
@@ -132,7 +133,7 @@ def read_feet(table: Table, model: MjcfNames) -> tuple[str, ...]:
 
 def read_timestep(table: Table) -> float:
     """Read the physics step, s."""
-    timestep = table.number("timestep", 0.002)
+    timestep = table.number("timestep", USUAL_TIMESTEP)
     low, high = TIMESTEPS
     if not low <= timestep <= high:
         raise table.mistake("timestep", f"{timestep:g} s is outside [{low:g}, {high:g}] s")

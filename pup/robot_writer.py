@@ -13,6 +13,7 @@ from pup.files import write_atomic
 from pup.robot import ROBOT_LIMIT, RobotDescription, TermSpec
 from pup.robot_mjcf import read_mjcf
 from pup.robot_parts import Actuator, ParameterSpec
+from pup.robot_reader import USUAL_TIMESTEP
 from pup.robot_toml import read_text
 
 WEIGHT = "phi/"
@@ -65,6 +66,8 @@ def write_corrected(
     for name, value in values.items():
         if name not in names:
             _set_weight(document, robot, name, value)
+    if float(document.get("timestep", USUAL_TIMESTEP)) != robot.timestep:
+        document["timestep"] = robot.timestep
     if robot.actuator != actuator:
         document["actuator"] = actuator
     document.pop("term", None)

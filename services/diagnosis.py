@@ -90,7 +90,7 @@ def run_diagnosis(
     check_folder(robot, out / CORRECTED)  # told before hours of fits, and not after them
     kept = out / CHECKPOINTS
     watch = Stopwatch(kept / SPENT, _digest(robot, recordings))
-    run = keeper(where, robot, kept)
+    run = keeper(where, kept)
     others = None
     with threadpool_limits(limits=1):  # the sums of BLAS depend on its threads, a verdict must not
         found = diagnose(
@@ -126,20 +126,20 @@ def _rivals(
     """Rivals of a diagnosis, whose replays are kept as the diagnosis's own are."""
 
     def replays_with(actuator: str) -> Replays:
-        run = watch.around(keeper(where, found.robot, kept, actuator)(found.measured))
+        run = watch.around(keeper(where, kept, actuator)(found.measured))
         return Replays(found.measured, robot_space(found.robot, actuator), run, where.lanes)
 
     return compare(found, replays_with, seed)
 
 
-def keeper(
-    where: Where, robot: RobotDescription, kept: Path, actuator: str = "pd"
-) -> Callable[[Measured], Runner]:
+def keeper(where: Where, kept: Path, actuator: str = "pd") -> Callable[[Measured], Runner]:
     """What runs batches of replays and keeps the answers in a folder."""
 
     def runner(measured: Measured) -> Runner:
         # Planned recordings are replayed too, and their answers are not of those measured.
-        store = Store(kept, _digest(robot, measured.recordings))  # names tell actuators apart
+        store = Store(
+            kept, _digest(measured.robot, measured.recordings)
+        )  # names tell actuators apart
         return store.around(where.runner(measured, actuator))
 
     return runner
@@ -205,5 +205,5 @@ def _provenance(
 
 
 def _digest(robot: RobotDescription, recordings: Sequence[Recording]) -> str:
-    parts = [str(MODEL), robot.digest, *(recording.digest for recording in recordings)]
+    parts = [str(MODEL), robot.digest, repr(robot.timestep), *(r.digest for r in recordings)]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

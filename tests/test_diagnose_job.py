@@ -165,7 +165,7 @@ def test_planned_recordings_do_not_take_answers_of_those_measured(tmp_path: Path
 
         return run
 
-    kept = keeper(Where(runner, 1, here=True), BENCH, tmp_path)
+    kept = keeper(Where(runner, 1, here=True), tmp_path)
     answers = []
     for runs in (poor(1), poor(2), poor(1)):
         measured = Measured.of(BENCH, runs)

@@ -252,6 +252,16 @@ def test_recordings_that_were_left_out_are_told(backlash: Diagnosis, tmp_path: P
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_substeps_that_were_halved_are_told(backlash: Diagnosis, tmp_path: Path) -> None:
+    step = backlash.robot.timestep
+    shown = page(replace(backlash, too_long=2 * step), tmp_path)
+    assert f"sub-steps of {2e3 * step:g} ms are too long" in shown.text
+    assert f"simulated in sub-steps of {1e3 * step:g} ms" in shown.text
+    assert "too long" not in page(backlash, tmp_path).text
+    assert document(backlash, "corrected")["timestep"] == step
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_an_error_that_nothing_explains_is_admitted(bench: Maker, tmp_path: Path) -> None:
     shown = page(bench.nothing(2.9), tmp_path)
     assert "No known effect is missing, but the simulator is off by 2.9 times" in shown.text

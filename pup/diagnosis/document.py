@@ -57,6 +57,7 @@ def document(diagnosis: Diagnosis, corrected: str) -> dict[str, Any]:
             "recovered": certificate.recovered if certificate.agree else None,
         },
         "nominal": {n: float(v) for n, v in diagnosis.nominal.fit.values.items()},
+        "timestep": robot.timestep,
         "samples": len(diagnosis.measured.values),
         "simulations": diagnosis.replays,
     }

@@ -42,6 +42,7 @@ from pup.diagnosis.result import Diagnosis
 from pup.diagnosis.search import Search, carried, search, search_on
 from pup.diagnosis.selection import Selector
 from pup.diagnosis.splits import splits
+from pup.diagnosis.substeps import shorter_stepped
 from pup.diagnosis.verdict import Answer, Finding, findings, in_order
 from pup.physics.actuators import per_joint
 from pup.physics.parameters import robot_space
@@ -157,6 +158,10 @@ def diagnose(
 
     if poor:
         return _undetermined(task, nominal, seen, poor.reason, poor.cure)
+    finer = shorter_stepped(nominal, replays, task.replays_of)
+    if finer is not None:
+        again = diagnose(finer, recordings, runner, lanes, progress, seed, effects)
+        return replace(again, replays=again.replays + replays.count, too_long=robot.timestep)
     nominal, first = _settled(task, nominal)
     if not nominal.certificate.holds:
         return _undetermined(task, nominal, seen, _unsettled(nominal))

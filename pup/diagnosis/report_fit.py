@@ -23,6 +23,8 @@ def nominal(diagnosis: Diagnosis, speech: Speech) -> Iterator[Html]:
     yield tag("p", _certificate(diagnosis))
     if len(diagnosis.measured.values):
         yield tag("p", _noise(diagnosis, speech))
+    if diagnosis.too_long:
+        yield tag("p", _substeps(diagnosis))
     yield tag(
         "p",
         f"{len(diagnosis.measured.values):,} readings were compared with "
@@ -51,6 +53,16 @@ def _certificate(diagnosis: Diagnosis) -> str:
     if told.recovered <= SELF:
         return f"{text}."
     return f"{text}, but leaves no more than {told.left / told.samples:.1%} of the noise there."
+
+
+def _substeps(diagnosis: Diagnosis) -> str:
+    """That the robot's own sub-steps are too long, and what was done about it."""
+    own, used = (1e3 * step for step in (diagnosis.too_long, diagnosis.robot.timestep))
+    return (
+        f"Its sub-steps of {own:g} ms are too long for what was recorded on the ground: in shorter "
+        f"ones the same robot moves otherwise by more than the readings' noise hides. So all was "
+        f"simulated in sub-steps of {used:g} ms, and the corrected robot has these."
+    )
 
 
 def _noise(diagnosis: Diagnosis, speech: Speech) -> str:

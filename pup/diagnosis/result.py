@@ -46,6 +46,8 @@ class Diagnosis:
       splits: how the nominal model's parameters differ between halves of the data, and how those
         of the model with what was found.
       lost: recordings that were left out, as nothing found in the others makes them follow.
+      too_long: the sub-steps that the robot was given with, s, where they are too long for these
+        recordings and `robot` has shorter ones; else 0.
     """
 
     robot: RobotDescription
@@ -69,6 +71,7 @@ class Diagnosis:
     origins: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     splits: tuple[tuple[Split, ...], tuple[Split, ...]] = ((), ())
     lost: tuple[str, ...] = ()
+    too_long: float = 0.0
 
     @property
     def unjudged(self) -> tuple[str, ...]:
