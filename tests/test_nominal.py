@@ -3,11 +3,27 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
+from diagnosis_cases import BENCH, recordings
 
 from pup.diagnosis import nominal
 from pup.diagnosis.document import document
-from pup.diagnosis.nominal import SPARE, Certificate, Nominal, certified
+from pup.diagnosis.fit import Fit
+from pup.diagnosis.fitting import fit_together
+from pup.diagnosis.noise import assumed_noise
+from pup.diagnosis.nominal import (
+    SPARE,
+    Certificate,
+    Nominal,
+    certified,
+    free_names,
+    nominal_coordinate,
+    otherwise_limited,
+)
+from pup.diagnosis.replays import Bench, Replays, threads
+from pup.diagnosis.residuals import Measured
+from pup.physics.parameters import robot_space
 from pup.robot import RobotDescription
 from tests.diagnoses import Maker
 
@@ -63,3 +79,24 @@ def test_after_a_first_look_effects_must_gain_what_fits_to_all_stop_short_by(
     told = some.beside(all_of_them)
     assert told.left == pytest.approx(left)
     assert some.holds and told.holds
+
+
+def test_a_limit_above_all_that_is_asked_for_is_not_the_end() -> None:
+    """There it has no slope; a fit that is at its minimum stays as it is."""
+    measured = Measured.of(BENCH, recordings({"tau_max/servo": 0.12}))
+    space, noise = robot_space(BENCH, "pd"), assumed_noise(measured)
+    replays = Replays(measured, space, threads(Bench(measured), 1), 1)
+    free = tuple(nominal_coordinate(space, name) for name in free_names(space, ground=False))
+    described = dict(zip(space.names, space.nominal, strict=True))
+
+    def fit(limit: float) -> Fit:
+        values = described | {"tau_max/servo": limit}
+        return Fit(free, np.array([c.coordinate(float(values[c.name])) for c in free]))
+
+    stuck, there = fits = fit(3.0), fit(0.12)
+    fit_together(fits, replays, noise)
+    assert stuck.chi2 > 1000 * there.chi2, "it leads nowhere from above"
+    found, same = otherwise_limited(fits, replays, noise)
+    assert found.values["tau_max/servo"] == pytest.approx(0.12, rel=0.01)
+    assert found.chi2 < 1.1 * len(measured.values)
+    assert same is there

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 STARTS, LANDED = 3, 2
 FLOORS = (0.2, 0.35, 0.5, 0.7, 0.9, 1.2)
 """Frictions that a fit may start from on the ground."""
+LIMITS = 8
+"""Torque limits of a group that a fit on the ground may go on from, over the whole search range."""
 SPREAD = 0.35
 """Of the starts around the nominal values, in logarithms."""
 NEAR = (0.1, 0.025, 0.025, 0.01)
@@ -143,6 +145,8 @@ def fit_nominal(replays: Replays, first: Noise, rng: np.random.Generator) -> Nom
         if ground and not noise_like(fit):
             fit.narrow, fit.done = True, False
     fit_together(fits, replays, noise)
+    if ground:
+        fits = otherwise_limited(fits, replays, noise)
     for away in NEAR:
         if _agree(*fits):
             break
@@ -220,12 +224,36 @@ def floors(fit: Fit) -> list[Array]:
         return [fit.at]
     own = fit.names.index("ground_friction")
     floor = fit.coordinates[own]
-    places = []
-    for friction in FLOORS:
-        at = fit.at.copy()
-        at[own] = floor.coordinate(friction)
-        places.append(at)
-    return places
+    return [_with(fit.at, own, floor.coordinate(friction)) for friction in FLOORS]
+
+
+def otherwise_limited(fits: Sequence[Fit], replays: Replays, noise: Noise) -> list[Fit]:
+    """Fits gone on with from other torque limits, where these follow better.
+
+    An impact may be all that asks for so much torque. Above what it asks for, a limit has no slope,
+    and on the way down to what it was the robot falls in many other ways.
+    """
+    gone_on = [
+        replace(fit.fresh(), residual=fit.residual, chi2=fit.chi2, narrow=True) for fit in fits
+    ]
+    for own, limit in enumerate(fits[0].coordinates):
+        if limit.name.startswith("tau_max/"):
+            ladder = np.linspace(limit.lower, limit.upper, LIMITS)
+            places = [[_with(fit.at, own, at) for at in ladder] for fit in gone_on]
+            start_best(gone_on, places, replays, noise)
+    chosen = [
+        after if after.chi2 < before.chi2 - before.least else before
+        for before, after in zip(fits, gone_on, strict=True)
+    ]
+    fit_together(chosen, replays, noise)
+    return chosen
+
+
+def _with(at: Array, own: int, value: float) -> Array:
+    """Coordinates with one of them changed."""
+    changed = at.copy()
+    changed[own] = value
+    return changed
 
 
 def _agree(first: Fit, second: Fit) -> bool:
