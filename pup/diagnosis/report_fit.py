@@ -59,8 +59,8 @@ def _substeps(diagnosis: Diagnosis) -> str:
     """That the robot's own sub-steps are too long, and what was done about it."""
     own, used = (1e3 * step for step in (diagnosis.too_long, diagnosis.robot.timestep))
     return (
-        f"Its sub-steps of {own:g} ms are too long for what was recorded on the ground: in shorter "
-        f"ones the same robot moves otherwise by more than the readings' noise hides. So all was "
+        f"The robot's sub-steps of {own:g} ms are too long for what was recorded on the ground: in "
+        f"shorter ones it moves otherwise by more than the noise of the readings hides. So all was "
         f"simulated in sub-steps of {used:g} ms, and the corrected robot has these."
     )
 
