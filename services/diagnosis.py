@@ -136,10 +136,9 @@ def keeper(where: Where, kept: Path, actuator: str = "pd") -> Callable[[Measured
     """What runs batches of replays and keeps the answers in a folder."""
 
     def runner(measured: Measured) -> Runner:
-        # Planned recordings are replayed too, and their answers are not of those measured.
-        store = Store(
-            kept, _digest(measured.robot, measured.recordings)
-        )  # names tell actuators apart
+        # Planned recordings are replayed too, and their answers are not of those measured; names
+        # tell actuators apart.
+        store = Store(kept, _digest(measured.robot, measured.recordings))
         return store.around(where.runner(measured, actuator))
 
     return runner

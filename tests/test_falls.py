@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from recordings import make
 
 from pup.diagnosis.falls import DOWN, TOPPLES, standing
 from pup.diagnosis.pieces import pieces
@@ -14,12 +15,10 @@ PERIOD = 0.02
 
 def recording(pitch: np.ndarray, support: str = "ground") -> Recording:
     ticks, joints = len(pitch), len(OP2.joints)
-    return Recording(
-        id="r",
+    return make(
         robot=OP2.name,
         motion="fall",
         support=support,
-        source="simulation",
         joints=OP2.joint_names,
         time=PERIOD * np.arange(ticks),
         target=np.zeros((ticks, joints)),

@@ -3,11 +3,11 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 from diagnosis_cases import BENCH, recordings
 
 from pup.diagnosis import nominal
+from pup.diagnosis.coordinates import described_at
 from pup.diagnosis.document import document
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.fitting import fit_together
@@ -87,13 +87,9 @@ def test_a_limit_above_all_that_is_asked_for_is_not_the_end() -> None:
     space, noise = robot_space(BENCH, "pd"), assumed_noise(measured)
     replays = Replays(measured, space, threads(Bench(measured), 1), 1)
     free = tuple(nominal_coordinate(space, name) for name in free_names(space, ground=False))
-    described = dict(zip(space.names, space.nominal, strict=True))
-
-    def fit(limit: float) -> Fit:
-        values = described | {"tau_max/servo": limit}
-        return Fit(free, np.array([c.coordinate(float(values[c.name])) for c in free]))
-
-    stuck, there = fits = fit(3.0), fit(0.12)
+    stuck, there = fits = [
+        Fit(free, described_at(free, space.at({"tau_max/servo": limit}))) for limit in (3.0, 0.12)
+    ]
     fit_together(fits, replays, noise)
     assert stuck.chi2 > 1000 * there.chi2, "it leads nowhere from above"
     found, same = otherwise_limited(fits, replays, noise)

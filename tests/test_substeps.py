@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import make
 
+from pup.diagnosis.coordinates import described_at
 from pup.diagnosis.fit import Fit
 from pup.diagnosis.nominal import Certificate, Nominal, free_names, nominal_coordinate
 from pup.diagnosis.replays import Bench, Replays, threads
@@ -31,12 +33,10 @@ def knees(support: str) -> Recording:
     for name in ("l_knee", "r_knee"):
         i = OP2.joint_names.index(name)
         target[:, i] += np.where(np.sin(2 * np.pi * 1.5 * time) > 0, 0.0, 0.1) * (time > 0.3)
-    return Recording(
-        id="knees",
+    return make(
         robot=OP2.name,
         motion="stand",
         support=support,
-        source="simulation",
         joints=OP2.joint_names,
         time=time,
         target=target,
@@ -53,8 +53,7 @@ def asked(robot: RobotDescription, support: str, sigma: float) -> RobotDescripti
         return Replays(some, space, threads(Bench(some), 1), 1)
 
     free = tuple(nominal_coordinate(space, n) for n in free_names(space, support == "ground"))
-    values = dict(zip(space.names, space.nominal, strict=True)) | LIGHT
-    fit = Fit(free, np.array([c.coordinate(float(values[c.name])) for c in free]))
+    fit = Fit(free, described_at(free, space.at(LIGHT)))
     noise = Noise(np.full(measured.channels, sigma), np.zeros(measured.channels), "assumed")
     nominal = Nominal(fit, noise, Certificate((1.0, 1.0), True, 0.0))
     return shorter_stepped(nominal, replays_of(measured), replays_of)

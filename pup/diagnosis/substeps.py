@@ -9,11 +9,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pup.diagnosis.nominal import Nominal
 from pup.diagnosis.replays import Replays
 from pup.diagnosis.residuals import Measured
 from pup.robot import RobotDescription
+
+Array = NDArray[np.float64]
 
 SHORTEST = 0.001
 """Sub-steps are not made shorter than this, s: each halving costs as much again as all before."""
@@ -41,9 +44,11 @@ def shorter_stepped(
     change = replays_of(replace(measured, robot=finer))([row])[0] - replays([row])[0]
     squares = (change / measured.deviation(nominal.noise)) ** 2
     runs = measured.recording * measured.channels + measured.channel
-    count = np.bincount(runs)
-    means = np.bincount(runs, squares) / np.maximum(count, 1)
-    alike = measured.grounded & (means < ELSEWHERE)[runs]
-    channel = measured.channel[alike]
-    told = np.bincount(channel, squares[alike]) / np.maximum(np.bincount(channel), 1)
+    alike = measured.grounded & (_means(squares, runs) < ELSEWHERE)[runs]
+    told = _means(squares[alike], measured.channel[alike])
     return finer if told.max(initial=0.0) > SEEN else None
+
+
+def _means(values: Array, of: NDArray[np.int64]) -> Array:
+    """The means of values by the number of what each is of."""
+    return np.asarray(np.bincount(of, values) / np.maximum(np.bincount(of), 1))
